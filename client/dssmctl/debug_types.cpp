@@ -622,11 +622,11 @@ Result<std::vector<DebugType>> debug_types_untrusted(const std::string& path,
 
   // Debug information is not to be fetched from the network.
   ::unsetenv("DEBUGINFOD_URLS");  // NOLINT(concurrency-mt-unsafe): no thread of dssmctl reads it
-  static const Dwfl_Callbacks kCallbacks = {.find_elf = ::dwfl_build_id_find_elf,
-                                            .find_debuginfo = ::dwfl_standard_find_debuginfo,
-                                            .section_address = ::dwfl_offline_section_address,
-                                            .debuginfo_path = nullptr};
-  const std::unique_ptr<Dwfl, DwflEnd> dwfl(::dwfl_begin(&kCallbacks));
+  const Dwfl_Callbacks callbacks = {.find_elf = ::dwfl_build_id_find_elf,
+                                    .find_debuginfo = ::dwfl_standard_find_debuginfo,
+                                    .section_address = ::dwfl_offline_section_address,
+                                    .debuginfo_path = nullptr};
+  const std::unique_ptr<Dwfl, DwflEnd> dwfl(::dwfl_begin(&callbacks));
   if (!dwfl) return failed(Errc::no_memory, ::dwfl_errmsg(-1));
   Dwfl_Module* const module =
       ::dwfl_report_offline(dwfl.get(), "", resolved(path).c_str(), fd.get());

@@ -157,6 +157,7 @@ TEST_P(TypesOfProgram, SayWhereBitFieldsAre) {
   const DebugType packed = type_in(program(GetParam()), "Packed");
   EXPECT_EQ(packed.type.alignment_bytes, 1U);
   EXPECT_EQ(packed.type.payload_bytes, sizeof(Packed));
+  static_assert(sizeof(Packed) == 16);  // that alone would allow an alignment of 8
   EXPECT_EQ(field_of(packed, "value").offset_bytes, 1U);
   Packed sample{};
   sample.across = 0x1abc;
@@ -242,7 +243,7 @@ TEST(DebugTypes, AreChosenByTheStreamsNameOrNotAtAll) {
   const auto several = choice("c-dwarf5", stream_of(16));
   ASSERT_FALSE(several);
   EXPECT_EQ(several.error().code, Errc::conflict);
-  EXPECT_THAT(several.error().message, HasSubstr("'Bumpers', 'PWSMotor', 'Wheels'"));
+  EXPECT_THAT(several.error().message, HasSubstr("'Bumpers', 'PWSMotor', 'Packed', 'Wheels'"));
   EXPECT_THAT(several.error().message, HasSubstr("--type"));
 
   const auto named = choice("c-dwarf5", stream_of(16, "pws_motor"));

@@ -69,6 +69,15 @@ TEST_F(SsmLogs, AreRecordingsWithOneStream) {
   EXPECT_EQ(to_ns(info.time), 1795250131'000'000'238) << "to the nanosecond";
 }
 
+TEST_F(SsmLogs, OfTimesThatFallAreSearchedExactly) {
+  const auto log =
+      Recording::open(save("a.log", "a 0 8 10 0.1 1000 0\n" + records({1, 2, 9, 10, 3})));
+  RecordedRawReader reader = log->open_raw_reader({"a", 0, ""}).value();
+  SampleInfo info;
+  ASSERT_EQ(reader.find(time_from_ns(3'500'000'000), info), ReadStatus::ok);
+  EXPECT_EQ(info.tid, 4);
+}
+
 TEST_F(SsmLogs, MayBeLongerThanWhatIsReadAtOnce) {
   std::string content = "big 0 8 10 0.001000 5.000000 0\n";
   constexpr int kRecords = 200'000;

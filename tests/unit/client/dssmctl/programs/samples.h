@@ -70,7 +70,7 @@ struct __attribute__((packed)) Packed {
   double value;
   uint32_t low : 5;
   uint32_t across : 13;
-  uint16_t end;
+  uint16_t end[2];
 };
 
 #endif
