@@ -232,10 +232,11 @@ struct PkiShowOptions : CommonOptions {
 using Options =
     std::variant<LsOptions, HostsOptions, NodesOptions, GraphOptions, ClockOptions, DoctorOptions,
                  PingOptions, InfoOptions, EchoOptions, PubOptions, RecordOptions, TriggerOptions,
-                 PlayOptions, ConvertOptions, FindOptions, ShowOptions, HzOptions, BwOptions, DelayOptions,
-                 CreateOptions, DescribeOptions, RmOptions, RightsOptions, PropertyGetOptions, PropertySetOptions,
-                 PlaybackOptions, PkiInitOptions, PkiRequestOptions, PkiIssueOptions,
-                 PkiInstallOptions, PkiRenewOptions, PkiRevokeOptions, PkiShowOptions>;
+                 PlayOptions, ConvertOptions, FindOptions, ShowOptions, HzOptions, BwOptions,
+                 DelayOptions, CreateOptions, DescribeOptions, RmOptions, RightsOptions,
+                 PropertyGetOptions, PropertySetOptions, PlaybackOptions, PkiInitOptions,
+                 PkiRequestOptions, PkiIssueOptions, PkiInstallOptions, PkiRenewOptions,
+                 PkiRevokeOptions, PkiShowOptions>;
 
 // Either options to work with, or a text that ends the program at once: help and version on
 // standard output, an error on standard error.
