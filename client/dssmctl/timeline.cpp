@@ -13,9 +13,9 @@ namespace dssm::ctl {
 namespace {
 
 Duration scaled(Duration duration, double factor) {
-  constexpr double kMax_ns = 9e18;
+  constexpr double kMaxNs = 9e18;
   return Duration(
-      std::llround(std::clamp(static_cast<double>(to_ns(duration)) * factor, -kMax_ns, kMax_ns)));
+      std::llround(std::clamp(static_cast<double>(to_ns(duration)) * factor, -kMaxNs, kMaxNs)));
 }
 
 double at(const PlaybackClock::Setting& setting, double real_s) {
@@ -95,8 +95,8 @@ Time Timeline::own_at(Time real) const {
 
 Time Timeline::now() const {
   if (!clock_) return own_at(WallClock::now());
-  constexpr double kMax_s = 9e9;  // 285 years: a Time has no more
-  return time_from_ns(std::llround(std::clamp(clock_->now_s(), -kMax_s, kMax_s) * 1e9));
+  constexpr double kMaxSeconds = 9e9;  // 285 years: a Time has no more
+  return time_from_ns(std::llround(std::clamp(clock_->now_s(), -kMaxSeconds, kMaxSeconds) * 1e9));
 }
 
 bool Timeline::has_jumped() {
@@ -110,9 +110,9 @@ bool Timeline::has_jumped() {
   const double speed = known_.paused ? 0 : known_.speed;
   const double as_of_now = began + speed * (known_real_s_ - before_s);
   const double is = at(known_, known_real_s_);
-  constexpr double kTolerance_s = 1e-3;
+  constexpr double kToleranceSeconds = 1e-3;
   const auto [least, greatest] = std::minmax({began, would_be, as_of_now});
-  return is < least - kTolerance_s || is > greatest + kTolerance_s;
+  return is < least - kToleranceSeconds || is > greatest + kToleranceSeconds;
 }
 
 Duration Timeline::until(Time time) const {

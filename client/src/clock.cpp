@@ -42,8 +42,8 @@ double real_now_s() noexcept {
 
 // At least 1 ns, so that a sleep for it comes to an end behind what it waits for.
 Duration duration_of(double seconds) noexcept {
-  constexpr double kMax_s = 9e9;
-  return Duration(std::llround(std::clamp(seconds, 1e-9, kMax_s) * 1e9));
+  constexpr double kMaxSeconds = 9e9;
+  return Duration(std::llround(std::clamp(seconds, 1e-9, kMaxSeconds) * 1e9));
 }
 
 // The same run, but it reads `time_s` at `real_s`.
@@ -82,7 +82,7 @@ PlaybackClock::Setting PlaybackClock::next_setting() const noexcept {
 double PlaybackClock::now_s() const noexcept { return state_->record->load().at(real_now_s()); }
 
 WaitStatus PlaybackClock::sleep_until(double time_s) const noexcept {
-  constexpr double kMaxSleep_s = 0.01;
+  constexpr double kMaxSleepSeconds = 0.01;
   for (;;) {
     const double real_s = real_now_s();
     const clock::PlaybackRun run = state_->record->load().run_at(real_s);
@@ -93,8 +93,8 @@ WaitStatus PlaybackClock::sleep_until(double time_s) const noexcept {
       if (*slept == WaitStatus::interrupted) return *slept;
       continue;
     }
-    const double rest_s = run.paused || speed == 0 ? kMaxSleep_s : missing_s / speed;
-    const timespec sleep = timespec_of(duration_of(std::min(rest_s, kMaxSleep_s)));
+    const double rest_s = run.paused || speed == 0 ? kMaxSleepSeconds : missing_s / speed;
+    const timespec sleep = timespec_of(duration_of(std::min(rest_s, kMaxSleepSeconds)));
     if (::nanosleep(&sleep, nullptr) != 0) return WaitStatus::interrupted;
   }
 }

@@ -13,6 +13,7 @@
 #include <climits>
 #include <cstdlib>
 #include <dssm/playback_clock.hpp>
+#include <new>
 #include <string_view>
 
 #include "core/base/time.hpp"
@@ -63,7 +64,8 @@ std::unique_ptr<Lockstep> Lockstep::from_environment() noexcept {
     return nullptr;
   }
   // The descriptors themselves stay open for programs that this one starts.
-  return std::unique_ptr<Lockstep>(new Lockstep(*std::move(mapping), duplicated(player)));
+  return std::unique_ptr<Lockstep>(new (std::nothrow)
+                                       Lockstep(*std::move(mapping), duplicated(player)));
 }
 
 LockstepPlace* Lockstep::own_place() noexcept {

@@ -355,16 +355,17 @@ void LocalRequests::list_clock_pairs(Answer answer) {
 }
 
 void LocalRequests::follow_playback(const Client& client, const proto::FollowPlayback& request,
-                                    const Answer& answer) {
+                                    Answer answer) {
   Result<proto::FollowPlayback> lead = clock_.lead(
       request, fmt::format("{}@{}", client->program, registry_.host()), MonoClock::now());
   if (!lead) return answer(std::move(lead).error());
-  fleet_->follow_playback(*lead, [answer](Result<proto::PlaybackFollowers> followers) {
-    if (!followers) return answer(std::move(followers).error());
-    Reply reply;
-    *reply.response.mutable_playback_followers() = *std::move(followers);
-    answer(std::move(reply));
-  });
+  fleet_->follow_playback(*lead,
+                          [answer = std::move(answer)](Result<proto::PlaybackFollowers> followers) {
+                            if (!followers) return answer(std::move(followers).error());
+                            Reply reply;
+                            *reply.response.mutable_playback_followers() = *std::move(followers);
+                            answer(std::move(reply));
+                          });
 }
 
 void LocalRequests::ping(const std::string& host, Answer answer) {

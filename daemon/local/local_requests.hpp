@@ -177,8 +177,7 @@ class LocalRequests {
   void list_all(Answer answer);
   void list_nodes(Answer answer);
   void list_clock_pairs(Answer answer);
-  void follow_playback(const Client& client, const proto::FollowPlayback& request,
-                       const Answer& answer);
+  void follow_playback(const Client& client, const proto::FollowPlayback& request, Answer answer);
   void ping(const std::string& host, Answer answer);
 
   Result<Reply> opened(const OpenEntry& entry);
