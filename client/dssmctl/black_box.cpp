@@ -148,9 +148,8 @@ Result<void> run_black_box(const RecordOptions& options, Session session, const 
   DSSM_TRY(prepare(folder));
   catch_stop_signals();
   const std::unique_ptr<Recorder> recorder = DSSM_TRY(Recorder::start(session, std::nullopt, plan));
-  const std::unique_ptr<TriggerWatch> watch =
-      DSSM_TRY(TriggerWatch::start(std::move(session), std::move(rules), options.min_interval));
-  BlackBox(options, how, *recorder, *watch, folder, out).run();
+  TriggerWatch watch(std::move(session), std::move(rules), options.min_interval);
+  BlackBox(options, how, *recorder, watch, folder, out).run();
   return {};
 }
 

@@ -304,13 +304,9 @@ void TriggerEvaluator::fire(RecordedTrigger trigger) {
 
 // --- watching
 
-Result<std::unique_ptr<TriggerWatch>> TriggerWatch::start(Session session,
-                                                          std::vector<TriggerRule> rules,
-                                                          Duration min_interval) {
-  std::unique_ptr<TriggerWatch> watch(
-      new TriggerWatch(std::move(session), std::move(rules), min_interval));
-  watch->thread_ = std::thread([raw = watch.get()] { raw->run(); });
-  return watch;
+TriggerWatch::TriggerWatch(Session session, std::vector<TriggerRule> rules, Duration min_interval)
+    : session_(std::move(session)), evaluator_(std::move(rules), min_interval) {
+  thread_ = std::thread([this] { run(); });
 }
 
 TriggerWatch::~TriggerWatch() {

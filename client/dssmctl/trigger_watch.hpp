@@ -17,7 +17,6 @@
 #include <dssm/recording.hpp>
 #include <dssm/session.hpp>
 #include <map>
-#include <memory>
 #include <mutex>
 #include <optional>
 #include <set>
@@ -125,10 +124,7 @@ class TriggerEvaluator {
 class TriggerWatch {
  public:
   // Begins. Creates kTriggerStream on this host.
-  //   fails  system (no thread left)
-  static Result<std::unique_ptr<TriggerWatch>> start(Session session,
-                                                     std::vector<TriggerRule> rules,
-                                                     Duration min_interval);
+  TriggerWatch(Session session, std::vector<TriggerRule> rules, Duration min_interval);
   TriggerWatch(const TriggerWatch&) = delete;
   TriggerWatch& operator=(const TriggerWatch&) = delete;
   ~TriggerWatch();
@@ -138,8 +134,6 @@ class TriggerWatch {
   std::vector<std::string> take_notices();
 
  private:
-  TriggerWatch(Session session, std::vector<TriggerRule> rules, Duration min_interval)
-      : session_(std::move(session)), evaluator_(std::move(rules), min_interval) {}
   void run();
   void subscribe_requests();
   void check_lists();
