@@ -21,13 +21,14 @@
 
 #include <algorithm>
 #include <array>
+#include <bit>
 #include <cerrno>
 #include <cstdlib>
 #include <cstring>
 #include <filesystem>
+#include <functional>
 #include <map>
 #include <memory>
-#include <numeric>
 #include <optional>
 
 #include "client/dssmctl/text.hpp"

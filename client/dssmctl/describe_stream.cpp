@@ -127,7 +127,7 @@ Json described_json(const StreamInfo& stream, const ProgramType& type) {
           {"left_out", type.found.left_out}};
 }
 
-// All streams that are not described.
+// All streams that are not described and that programs of this PC have open.
 Result<void> describe_all(Session& session, const DescribeOptions& options, Output& out) {
   Json all = Json::array();
   std::optional<Error> failure;
@@ -135,16 +135,21 @@ Result<void> describe_all(Session& session, const DescribeOptions& options, Outp
     // Lists leave out the fields of many types; the stream may be gone by now.
     const Result<StreamInfo> stream = session.stream_info(listed.id);
     if (!stream || !stream->type.fields.empty()) continue;
+    if (DSSM_TRY(programs_here(session, *stream)).empty()) continue;
     const Result<ProgramType> type = describe_stream(session, *stream, options);
     if (!type) {
       failure = type.error();
-      print_error(type.error().message);
+      print_error(fmt::format("dssmctl: describe: {}\n", escaped_message(type.error().message)));
       continue;
     }
     all.push_back(described_json(*stream, *type));
     if (!options.json) print_described(*stream, *type, false, out);
   }
-  if (options.json) out.add(json_document({{"streams", std::move(all)}}));
+  if (options.json) {
+    out.add(json_document({{"streams", std::move(all)}}));
+  } else if (all.empty() && !failure) {
+    out.add("nothing to do: all streams that programs of this PC have open are described\n");
+  }
   if (!failure) return {};
   return Error{failure->code, "some streams could not be described"};
 }

@@ -39,9 +39,10 @@ TypeInfo obvious_type(Session& session, const RawReader& reader) {
   if (!reader.type().fields.empty()) return {};
   const auto type = obvious_type_of_programs(session, reader.id());
   if (!type) return {};
-  print_error(fmt::format("'{}' is shown as {} of {}; `dssmctl describe {}` shows it so everywhere",
-                          escaped(reader.id().str()), escaped(type->found.type.str()), type->source,
-                          escaped(reader.id().str())));
+  print_error(fmt::format(
+      "dssmctl: echo: '{}' is shown as {} of {}; `dssmctl describe {}` shows it so everywhere\n",
+      escaped(reader.id().str()), escaped(type->found.type.str()), type->source,
+      escaped(reader.id().str())));
   return type->found.type;
 }
 

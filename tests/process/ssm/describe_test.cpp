@@ -93,7 +93,8 @@ TEST_F(Describe, EchoShowsTheFieldsOfAProgramThatRuns) {
   const Finished echo = ctl({"echo", "--last", "spur_odometry:3"});
   ASSERT_EQ(echo.exit_status, 0) << echo.err;
   EXPECT_THAT(echo.out, HasSubstr("theta: 0.25\n"));
-  EXPECT_THAT(echo.err, HasSubstr("dssmctl describe spur_odometry:3"));
+  EXPECT_THAT(echo.err,
+              HasSubstr("dssmctl describe spur_odometry:3@pc1` shows it so everywhere\n"));
   EXPECT_TRUE(session.stream_info(kStream)->type.fields.empty()) << "echo changes nothing";
 }
 

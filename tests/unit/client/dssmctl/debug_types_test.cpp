@@ -11,6 +11,7 @@
 
 #include <algorithm>
 #include <cstddef>
+#include <cstring>
 #include <dssm/describe.hpp>
 #include <fstream>
 #include <iterator>

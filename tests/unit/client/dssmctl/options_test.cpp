@@ -312,5 +312,27 @@ TEST(CommandLine, TakesWhatABlackBoxNeeds) {
             "dssmctl: trigger: NAME has 1 to 63 bytes; see 'dssmctl trigger --help'\n");
 }
 
+TEST(CommandLine, OfRecordingsTellsFilesFromPatterns) {
+  const auto play = options_of<PlayOptions>({"play", "a.log", "odo*", "b.mcap", "./c", "scan"});
+  EXPECT_EQ(play.file, "a.log");
+  EXPECT_EQ(play.more_files, (std::vector<std::string>{"b.mcap", "./c"}));
+  EXPECT_EQ(play.patterns, (std::vector<std::string>{"odo*", "scan"}));
+
+  const auto convert =
+      options_of<ConvertOptions>({"convert", "a.log", "b.log", "--stream", "x", "out.mcap"});
+  EXPECT_EQ(convert.file, "a.log");
+  EXPECT_EQ(convert.more_files, std::vector<std::string>{"b.log"});
+  EXPECT_EQ(convert.out, "out.mcap");
+  EXPECT_NE(error_of({"convert", "a.log", "b.txt"}).find("b.txt"), std::string::npos);
+}
+
+TEST(CommandLine, OfDescribeTakesAFileOnlyForOneStream) {
+  EXPECT_EQ(options_of<DescribeOptions>({"describe"}).stream, "");
+  const auto one = options_of<DescribeOptions>({"describe", "odo", "--from", "a", "--type", "B"});
+  EXPECT_EQ(one.from, "a");
+  EXPECT_EQ(one.type, "B");
+  EXPECT_NE(error_of({"describe", "--from", "a"}).find("--from"), std::string::npos);
+}
+
 }  // namespace
 }  // namespace dssm::ctl
