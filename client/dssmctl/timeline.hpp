@@ -74,7 +74,7 @@ class Timeline {
   // had run on. A change of speed alone is not a jump.
   bool has_jumped();
 
-  // In real time, how long until it is `time`, if nobody changes it; zero when that is over in the
+  // In real time, how long until it is `time`, if no program changes it; zero when that is over in the
   // direction in which it runs.
   Duration until(Time time) const;
 

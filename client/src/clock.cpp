@@ -40,7 +40,7 @@ double real_now_s() noexcept {
   return static_cast<double>(seconds) + static_cast<double>(ns - seconds * 1'000'000'000) * 1e-9;
 }
 
-// At least 1 ns, so that a sleep for it comes to an end behind what it waits for.
+// At least 1 ns, so that a sleep for it does not end too early.
 Duration duration_of(double seconds) noexcept {
   constexpr double kMaxSeconds = 9e9;
   return Duration(std::llround(std::clamp(seconds, 1e-9, kMaxSeconds) * 1e9));

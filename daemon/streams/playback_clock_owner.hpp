@@ -4,7 +4,7 @@
 // requested, or after a restart of dssmd taken back from the first program that still has it.
 //
 // A program on any host may have the clocks of all hosts follow that of its own PC: it repeats that
-// once a second, and a clock that was not told so for kLease shows the real time again.
+// once a second; a clock that gets no renewal for kLease shows the real time again.
 #pragma once
 
 #include <cstdint>

@@ -123,7 +123,7 @@ TEST_F(Lockstep, WaitsForAProgramThatWaitsForNothingAndSaysSo) {
   EXPECT_EQ(running.status(), 0);
 }
 
-// Nothing of it depends on a player that is no more.
+// Programs do not depend on a player that has ended.
 TEST_F(Lockstep, OfAPlayerThatWasKilledEnds) {
   const std::string out = folder_.file("out");
   Running running(argv({"play", file_, "slow", "--lockstep", program("wait") + " > " + out,
