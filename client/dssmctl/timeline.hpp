@@ -74,8 +74,8 @@ class Timeline {
   // had run on. A change of speed alone is not a jump.
   bool has_jumped();
 
-  // In real time, how long until it is `time`, if no program changes it; zero when that is over in the
-  // direction in which it runs.
+  // In real time, how long until it is `time`, if no program changes it; zero when that is over in
+  // the direction in which it runs.
   Duration until(Time time) const;
 
   // The stamp of a sample of `time`: that, or the present time when it is due.
