@@ -31,6 +31,10 @@
 namespace dssm::ctl {
 namespace {
 
+void print_notice(const std::string& text) {
+  print_error(fmt::format("dssmctl: play: {}\n", text));
+}
+
 // The part of the recording that is played.
 struct PlayedPart {
   Time from = Time::max(), to = Time::min();
@@ -61,8 +65,7 @@ Result<PlayedPart> played_part(const Recording& recording, const PlayOptions& op
   return range;
 }
 
-// The samples of the recording that are played, in both directions. What next() returned can be
-// given back, so that it comes again if the direction stays.
+// The samples of the recording that are played, in both directions.
 class Course {
  public:
   // wanted(): whether the stream with that index is played
@@ -154,9 +157,9 @@ class Player {
       });
       if (is_played || stream.writers > 0 || stream.newest == kNoTid) continue;
       const std::string name = escaped(short_name(stream.id));
-      print_error(
-          fmt::format("dssmctl: play: '{0}' has samples of an earlier run, which a program "
-                      "may read; `dssmctl rm {0}` removes it\n",
+      print_notice(
+          fmt::format("'{0}' has samples of an earlier run, which a program may read; `dssmctl rm "
+                      "{0}` removes it",
                       name));
     }
     return {};
@@ -355,7 +358,6 @@ class Player {
 
   // Pauses, and plays one sample.
   Result<void> step(Timeline& timeline, bool backwards) {
-    timeline.set_paused(true);
     const RecordedSample* next = course_.peek(backwards);
     // After a step in the other direction it would be the one that was played last.
     if (next && last_stepped_ && last_stepped_->first != backwards &&
@@ -363,9 +365,9 @@ class Player {
       course_.taken();
       next = course_.peek(backwards);
     }
-    if (!next) return {};
+    if (!next) return timeline.set_paused(true), Result<void>();
     const Time time = next->info.time;
-    timeline.set_time(time);
+    timeline.start(time, timeline.speed(), true);
     DSSM_TRY(write(*next, timeline.stamp(time)));
     course_.taken();
     last_stepped_ = {backwards, time};
@@ -407,12 +409,9 @@ class Player {
 }  // namespace
 
 Result<void> run(const PlayOptions& options, Output& out) {
-  const auto print_notice = [](const std::string& text) {
-    print_error(fmt::format("dssmctl: play: {}\n", text));
-  };
   const Recording recording = DSSM_TRY(open_recording(options.file, options.more_files));
   for (const std::string& warning : recording.warnings()) {
-    print_error(fmt::format("dssmctl: play: {}\n", escaped_message(warning)));
+    print_notice(escaped_message(warning));
   }
   const PlayedPart range = DSSM_TRY(played_part(recording, options));
   Session session = DSSM_TRY(connect(options));

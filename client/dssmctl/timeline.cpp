@@ -54,9 +54,10 @@ void SharedPlayback::share(bool ends) {
   const auto followers = session_.share_playback_clock(driver_, ends);
   const auto report = [&](const std::string& host, const Error& error) {
     if (ends || !reported_.insert(host).second) return;
-    on_failure_(host.empty() ? error.message
+    const std::string reason = escaped_message(error.message);
+    on_failure_(host.empty() ? reason
                              : fmt::format("the playback clock of '{}' does not follow: {}",
-                                           escaped(host), escaped_message(error.message)));
+                                           escaped(host), reason));
   };
   if (!followers) return report({}, followers.error());
   for (const PlaybackFollower& follower : *followers) {
