@@ -15,9 +15,12 @@
 #include <algorithm>
 #include <cerrno>
 #include <climits>
+#include <cstdlib>
 #include <cstring>
 #include <filesystem>
 #include <fstream>
+#include <optional>
+#include <set>
 #include <string_view>
 
 #include "client/dssmctl/text.hpp"
@@ -30,24 +33,43 @@ namespace {
 using clock::LockstepPage;
 using clock::LockstepPlace;
 
-// Whether the thread sleeps, or has ended. One that waits for a disk or is stopped does not.
-bool is_asleep(pid_t process, const std::string& thread) {
-  std::ifstream file(fmt::format("/proc/{}/task/{}/stat", process, thread));
-  std::string line;
-  if (!std::getline(file, line)) return true;
-  const std::size_t name_end = line.rfind(')');  // the name may hold anything
-  if (name_end == std::string::npos || name_end + 2 >= line.size()) return true;
-  const char state = line[name_end + 2];
-  return state == 'S' || state == 'I' || state == 'Z' || state == 'X';
+// How often the thread went to sleep, if it sleeps now, or has ended (0). Empty: it runs, or waits
+// for a disk, or is stopped.
+std::optional<std::uint64_t> sleep_count(pid_t process, const std::string& thread) {
+  std::ifstream file(fmt::format("/proc/{}/task/{}/status", process, thread));
+  constexpr std::string_view kState = "State:\t", kSwitches = "voluntary_ctxt_switches:\t";
+  for (std::string line; std::getline(file, line);) {
+    if (line.starts_with(kState)) {
+      const char state = line.size() > kState.size() ? line[kState.size()] : 'X';
+      if (state == 'Z' || state == 'X') return 0;
+      if (state != 'S' && state != 'I') return std::nullopt;
+    } else if (line.starts_with(kSwitches)) {
+      return std::strtoull(line.c_str() + kSwitches.size(), nullptr, 10);
+    }
+  }
+  return 0;
 }
 
-bool are_all_asleep(pid_t process) {
+// The sum for all threads of the process but `except`; empty: one of them does not sleep.
+std::optional<std::uint64_t> sleep_count_of_all(pid_t process, const std::set<pid_t>& except) {
+  std::uint64_t sum = 0;
   std::error_code error;
   for (const auto& entry :
        std::filesystem::directory_iterator(fmt::format("/proc/{}/task", process), error)) {
-    if (!is_asleep(process, entry.path().filename())) return false;
+    const std::string thread = entry.path().filename();
+    if (except.contains(std::atoi(thread.c_str()))) continue;
+    const auto count = sleep_count(process, thread);
+    if (!count) return std::nullopt;
+    sum += *count;
   }
-  return true;
+  return sum;
+}
+
+// Whether there is a moment at which all these threads sleep. One that is asked early may be woken
+// by one that is asked late: none may have slept anew until it is asked again.
+bool are_all_asleep(pid_t process, const std::set<pid_t>& except) {
+  const auto count = sleep_count_of_all(process, except);
+  return count && sleep_count_of_all(process, except) == count;
 }
 
 std::string status_text(int status) {
@@ -221,18 +243,22 @@ std::uint64_t Lockstep::turns_taken(const Program& program) noexcept {
 }
 
 bool Lockstep::is_waiting(Program& program, bool with_all_threads, bool accept_elsewhere) {
-  std::set<pid_t> processes;
-  for (LockstepPlace& place : program.page().places) {
+  LockstepPage& page = program.page();
+  const std::uint32_t requests = page.requests_ended.load();
+  if (page.requests_begun.load() != requests && !accept_elsewhere) return false;
+  std::set<pid_t> processes, waiting;
+  for (LockstepPlace& place : page.places) {
     const std::uint32_t state = place.state.load();
     if (state == LockstepPlace::unused) continue;
     const pid_t process = place.process.load(), thread = place.thread.load();
     processes.insert(process);
     if (state == LockstepPlace::waiting) {
       program.elsewhere.erase(thread);
+      waiting.insert(thread);
       continue;
     }
     const bool counts = accept_elsewhere || program.elsewhere.contains(thread);
-    if (!counts || !is_asleep(process, std::to_string(thread))) return false;
+    if (!counts || !sleep_count(process, std::to_string(thread))) return false;
     if (place.state.load() == LockstepPlace::waiting) continue;  // by now
     if (::kill(process, 0) != 0 && errno == ESRCH) {
       place.state = LockstepPlace::unused;  // it was killed
@@ -248,8 +274,10 @@ bool Lockstep::is_waiting(Program& program, bool with_all_threads, bool accept_e
       }
     }
   }
-  return !with_all_threads || std::all_of(processes.begin(), processes.end(),
-                                          [](pid_t process) { return are_all_asleep(process); });
+  if (!with_all_threads) return true;
+  const auto sleeps = [&](pid_t process) { return are_all_asleep(process, waiting); };
+  return std::all_of(processes.begin(), processes.end(), sleeps) &&
+         (page.requests_begun.load() == requests || accept_elsewhere);
 }
 
 Result<bool> Lockstep::await(Program& program, bool with_all_threads) {

@@ -76,11 +76,11 @@ void Timeline::change(std::optional<Time> time, std::optional<double> speed,
                       std::optional<bool> paused) {
   if (clock_) {
     const Time from = WallClock::now() + lead_;
-    clock_->change_at(from, time ? std::optional(seconds_of(*time)) : std::nullopt, speed, paused);
+    known_real_s_ = seconds_of(from);
+    known_ = clock_->change_at(from, time ? std::optional(seconds_of(*time)) : std::nullopt, speed,
+                               paused);
     // What follows here works on what is then.
     if (lead_ > Duration::zero()) std::this_thread::sleep_for(lead_);
-    known_ = clock_->setting();
-    known_real_s_ = seconds_of(WallClock::now());
     return;
   }
   base_time_ = time.value_or(now());

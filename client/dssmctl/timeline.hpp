@@ -88,8 +88,10 @@ class Timeline {
 
   std::optional<PlaybackClock> clock_;
   const Duration lead_;
-  Setting known_;            // of clock_, at the last has_jumped() or change of ours
-  double known_real_s_ = 0;  // when
+  // Of clock_, at the last has_jumped() or since the last change of ours, and when that was. What
+  // another program has changed since then is still to be found.
+  Setting known_;
+  double known_real_s_ = 0;
   // Without clock_: at that real time it was so late.
   Time base_real_{}, base_time_{};
   double speed_ = 1;

@@ -46,6 +46,10 @@ Duration duration_of(double seconds) noexcept {
   return Duration(std::llround(std::clamp(seconds, 1e-9, kMaxSeconds) * 1e9));
 }
 
+PlaybackClock::Setting setting_of(const clock::PlaybackRun& run) noexcept {
+  return {run.offset_s, run.speed, run.paused != 0, run.paused_at_s};
+}
+
 // The same run, but it reads `time_s` at `real_s`.
 clock::PlaybackRun rebased(clock::PlaybackRun run, double time_s, double real_s) noexcept {
   run.offset_s = time_s - run.speed * real_s;
@@ -70,13 +74,11 @@ PlaybackClock::PlaybackClock(std::shared_ptr<detail::PlaybackClockState> state) 
 PlaybackClock::Setting PlaybackClock::setting() const noexcept {
   const clock::PlaybackSetting setting = state_->record->load();
   // Without a change to come, and so without asking for the time, it is what it was set to.
-  const clock::PlaybackRun& now = setting.change_s > 0 ? setting.run_at(real_now_s()) : setting.run;
-  return {now.offset_s, now.speed, now.paused != 0, now.paused_at_s};
+  return setting_of(setting.change_s > 0 ? setting.run_at(real_now_s()) : setting.run);
 }
 
 PlaybackClock::Setting PlaybackClock::next_setting() const noexcept {
-  const clock::PlaybackRun run = state_->record->load().run;
-  return {run.offset_s, run.speed, run.paused != 0, run.paused_at_s};
+  return setting_of(state_->record->load().run);
 }
 
 double PlaybackClock::now_s() const noexcept { return state_->record->load().at(real_now_s()); }
@@ -132,18 +134,21 @@ void PlaybackClock::set_paused(bool paused) noexcept {
   });
 }
 
-void PlaybackClock::change_at(Time from, std::optional<double> time_s, std::optional<double> speed,
-                              std::optional<bool> paused) noexcept {
-  state_->record->update([&](const clock::PlaybackSetting& setting) {
+PlaybackClock::Setting PlaybackClock::change_at(Time from, std::optional<double> time_s,
+                                                std::optional<double> speed,
+                                                std::optional<bool> paused) noexcept {
+  clock::PlaybackRun run;
+  const bool changed = state_->record->update([&](const clock::PlaybackSetting& setting) {
     const double now_s = real_now_s();
     const double from_s = std::max(static_cast<double>(to_ns(from)) * 1e-9, now_s);
     const clock::PlaybackRun before = setting.run_at(now_s);
-    clock::PlaybackRun run = before;
+    run = before;
     run.speed = speed.value_or(run.speed);
     run.paused = paused.value_or(run.paused != 0);
-    return clock::PlaybackSetting{rebased(run, time_s.value_or(before.at(from_s)), from_s), from_s,
-                                  before};
+    run = rebased(run, time_s.value_or(before.at(from_s)), from_s);
+    return clock::PlaybackSetting{run, from_s, before};
   });
+  return changed ? setting_of(run) : setting();
 }
 
 }  // namespace dssm

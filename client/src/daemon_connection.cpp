@@ -5,6 +5,7 @@
 #include <poll.h>
 #include <sys/socket.h>
 
+#include "client/src/lockstep.hpp"
 #include "core/base/try.hpp"
 #include "core/wire/local_protocol.hpp"
 
@@ -76,6 +77,7 @@ Result<NewConnection> NewConnection::greet(const SessionOptions& options, std::u
 
 Result<local::Response> NewConnection::exchange(local::Request request,
                                                 std::span<const int> request_fds) {
+  const Lockstep::Request in_lockstep;
   input_.fds.clear();
   request.set_serial(++serial_);
   DSSM_TRY(send_frame(socket_.get(), request, request_fds, true));
@@ -123,6 +125,7 @@ bool DaemonConnection::is_up() const {
 }
 
 Result<Answer> DaemonConnection::call(local::Request request, std::span<const int> fds) {
+  const Lockstep::Request in_lockstep;
   const std::size_t fds_expected = fds_with_answer(request);
   const MonoTime deadline = deadline_in(request_timeout_);
   const auto timed_out = [&](const char* reason) {

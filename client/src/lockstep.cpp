@@ -112,6 +112,14 @@ void Lockstep::recheck() noexcept {
   }
 }
 
+Lockstep::Request::Request() noexcept {
+  if (Lockstep* const lockstep = of_process()) lockstep->page().requests_begun.fetch_add(1);
+}
+
+Lockstep::Request::~Request() {
+  if (Lockstep* const lockstep = of_process()) lockstep->page().requests_ended.fetch_add(1);
+}
+
 std::optional<WaitStatus> Lockstep::wait_until(MonoTime deadline,
                                                const std::function<bool()>& ready) noexcept {
   if (deadline == kNever) return wait_for(Duration::max(), ready);

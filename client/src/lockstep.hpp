@@ -34,6 +34,15 @@ class Lockstep {
   // All threads of this process that wait here call their ready() again.
   void recheck() noexcept;
 
+  // For as long as it exists its thread waits for an answer of dssmd: the player waits for that.
+  class Request {
+   public:
+    Request() noexcept;
+    ~Request();
+    Request(const Request&) = delete;
+    Request& operator=(const Request&) = delete;
+  };
+
  private:
   static std::unique_ptr<Lockstep> from_environment() noexcept;
   Lockstep(SharedMapping mapping, UniqueFd player) noexcept

@@ -16,6 +16,9 @@
 // A thread whose turn brought nothing (no sample, and not late enough) waits again at once.
 // Otherwise it counts the turn in `taken` and returns to the program.
 //
+// A thread that waits for an answer of dssmd sleeps, too, but goes on by itself: it is counted in
+// `requests_begun` before that and in `requests_ended` after it.
+//
 // The environment variable of kVariable has the two descriptors: "MEMORY,EVENTFD".
 #pragma once
 
@@ -38,7 +41,7 @@ struct LockstepPlace {
 
 struct LockstepPage {
   static constexpr std::uint64_t kMagic = 0x504554534d535344;  // "DSSMSTEP"
-  static constexpr std::uint32_t kLayoutVersion = 1;
+  static constexpr std::uint32_t kLayoutVersion = 2;
   static constexpr std::size_t kPlaces = 168;
   static constexpr std::size_t kBytes = 4096;
   static constexpr const char* kVariable = "DSSM_LOCKSTEP";
@@ -49,7 +52,8 @@ struct LockstepPage {
   std::atomic<std::int64_t> now_ns;     // the playback time; the player writes it
   std::atomic<std::uint32_t> too_many;  // not 0: a thread found no place
   std::int32_t player;                  // its process
-  std::uint32_t reserved[8];
+  std::atomic<std::uint32_t> requests_begun, requests_ended;
+  std::uint32_t reserved[6];
   LockstepPlace places[kPlaces];
 };
 static_assert(offsetof(LockstepPage, places) == 64 && sizeof(LockstepPlace) == 24 &&

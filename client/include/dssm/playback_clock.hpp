@@ -62,8 +62,9 @@ class PlaybackClock {
   // The same at the real time `from`, which may be to come by some seconds at most: so several
   // hosts can change it at the same moment (Session::share_playback_clock()). Until then it runs
   // as it does now. Empty: unchanged. Replaces a change that is still to come.
-  void change_at(Time from, std::optional<double> time_s, std::optional<double> speed,
-                 std::optional<bool> paused) noexcept;
+  //   returns  what it is then, if no program changes it again
+  Setting change_at(Time from, std::optional<double> time_s, std::optional<double> speed,
+                    std::optional<bool> paused) noexcept;
 
  private:
   friend class Session;

@@ -90,7 +90,9 @@ void hand_over() {
       const dssm::Sample<Numbered> sample = samples.front();
       samples.pop_front();
       lock.unlock();
-      for (volatile int work = 0; work < 100'000;) work = work + 1;
+      // Works, and sleeps until dssmd has answered.
+      for (volatile int work = 0; work < 300'000;) work = work + 1;
+      for (int request = 0; request < 4; ++request) (void)session().list_own_streams();
       number = sample.value.number;
       print("fast", sample);
     }
