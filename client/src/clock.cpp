@@ -36,8 +36,9 @@ namespace {
 // Rounded as gettimeSSM_real() rounds it: or a clock that was set to a time could show, right after
 // that, one that is a step of the number's resolution (0.24 us) earlier.
 double real_now_s() noexcept {
-  const std::int64_t ns = to_ns(WallClock::now()), seconds = ns / 1'000'000'000;
-  return static_cast<double>(seconds) + static_cast<double>(ns - seconds * 1'000'000'000) * 1e-9;
+  timespec now{};
+  ::clock_gettime(CLOCK_REALTIME, &now);
+  return static_cast<double>(now.tv_sec) + static_cast<double>(now.tv_nsec) * 1e-9;
 }
 
 // At least 1 ns, so that a sleep for it does not end too early.
@@ -81,7 +82,7 @@ PlaybackClock::Setting PlaybackClock::next_setting() const noexcept {
   return setting_of(state_->record->load().run);
 }
 
-double PlaybackClock::now_s() const noexcept { return state_->record->load().at(real_now_s()); }
+double PlaybackClock::now_s() const noexcept { return state_->record->at(real_now_s()); }
 
 WaitStatus PlaybackClock::sleep_until(double time_s) const noexcept {
   constexpr double kMaxSleepSeconds = 0.01;

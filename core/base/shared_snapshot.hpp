@@ -38,6 +38,7 @@
 #include <cstdint>
 #include <cstring>
 #include <type_traits>
+#include <utility>
 
 namespace dssm {
 
@@ -61,6 +62,7 @@ class SharedSnapshot {
   template <std::size_t bytes = sizeof(T)>
   std::uint64_t load(T& out) const noexcept {
     static_assert(bytes % 8 == 0 && bytes <= sizeof(T));
+    constexpr std::make_index_sequence<bytes / 8> kWords;
     std::array<std::uint64_t, bytes / 8> copy;
     for (int i = 0; i < kMaxTries; ++i) {
       // Acquire: pairs with the release store of the generation in store(), so that the words of
@@ -70,11 +72,16 @@ class SharedSnapshot {
       const auto& record = records_[before % 2];
       // Acquire: pairs with the release stores of the words in store(), so that the generation
       // below is not older than the newest word.
-      for (std::size_t word = 0; word < copy.size(); ++word) {
-        copy[word] = record[word].load(std::memory_order_acquire);
-      }
+      [&]<std::size_t... word>(std::index_sequence<word...>) {
+        ((copy[word] = record[word].load(std::memory_order_acquire)), ...);
+      }(kWords);
       if (generation_.load(std::memory_order_relaxed) != before) continue;
-      std::memcpy(static_cast<void*>(&out), copy.data(), bytes);
+      // Word by word, in registers: a processor takes long to load several words at once that were
+      // just stored one by one.
+      auto* const to = reinterpret_cast<std::byte*>(&out);
+      [&]<std::size_t... word>(std::index_sequence<word...>) {
+        (std::memcpy(to + 8 * word, &copy[word], 8), ...);
+      }(kWords);
       return before;
     }
     return 0;

@@ -68,6 +68,13 @@ class PlaybackRecord {
 
   // Real time, where a hostile program keeps changing it.
   PlaybackSetting load() const noexcept;
+  // load().at(real_s).
+  double at(double real_s) const noexcept {
+    PlaybackSetting setting;
+    page().setting.load<offsetof(PlaybackSetting, before)>(setting);
+    if (real_s < setting.change_s) setting = load();
+    return setting.at(real_s);
+  }
 
   // Replaces the setting by change(setting), under the lock. False, and the setting unchanged, when
   // it did not get the lock (RobustLock::kMaxWait).

@@ -66,7 +66,7 @@ ssmTimeT gettimeSSM_real(void) {
   return static_cast<double>(now.tv_sec) + static_cast<double>(now.tv_nsec) * 1e-9;
 }
 
-ssmTimeT gettimeSSM(void) {
+[[gnu::flatten]] ssmTimeT gettimeSSM(void) {
   const auto now = process().clock().now_s();
   return now ? *now : gettimeSSM_real();
 }
