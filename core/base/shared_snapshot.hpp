@@ -72,16 +72,14 @@ class SharedSnapshot {
       const auto& record = records_[before % 2];
       // Acquire: pairs with the release stores of the words in store(), so that the generation
       // below is not older than the newest word.
-      [&]<std::size_t... word>(std::index_sequence<word...>) {
-        ((copy[word] = record[word].load(std::memory_order_acquire)), ...);
-      }(kWords);
+      for_each(kWords, [&](std::size_t word) {
+        copy[word] = record[word].load(std::memory_order_acquire);
+      });
       if (generation_.load(std::memory_order_relaxed) != before) continue;
       // Word by word, in registers: a processor takes long to load several words at once that were
       // just stored one by one.
       auto* const to = reinterpret_cast<std::byte*>(&out);
-      [&]<std::size_t... word>(std::index_sequence<word...>) {
-        (std::memcpy(to + 8 * word, &copy[word], 8), ...);
-      }(kWords);
+      for_each(kWords, [&](std::size_t word) { std::memcpy(to + 8 * word, &copy[word], 8); });
       return before;
     }
     return 0;
@@ -102,6 +100,12 @@ class SharedSnapshot {
   }
 
  private:
+  // Without a loop, so that `use` works in registers.
+  template <std::size_t... word, class Use>
+  static void for_each(std::index_sequence<word...>, Use use) noexcept {
+    (use(word), ...);
+  }
+
   std::atomic<std::uint64_t> generation_;
   std::atomic<std::uint64_t> records_[2][sizeof(T) / 8];
 };

@@ -210,8 +210,7 @@ SSM_tid dssm_ssm_next(SSM_sid sid, SSM_tid tid, int waits) {
   return read_into(sid, data, ytime, by_tid(tid));
 }
 
-[[gnu::flatten]] SSM_tid readSSM_time(SSM_sid sid, void* data, ssmTimeT ytime,
-                                      ssmTimeT* ret_time) {
+[[gnu::flatten]] SSM_tid readSSM_time(SSM_sid sid, void* data, ssmTimeT ytime, ssmTimeT* ret_time) {
   return read_into(sid, data, ret_time, by_time(ytime));
 }
 
