@@ -183,8 +183,8 @@ _dssmctl() {
   case ${verb#help } in
     "" | help)
       mapfile -t COMPREPLY < <(compgen -W \
-        "bw clock convert create delay describe doctor echo find graph hosts hz info ls nodes ping pki play \
-          playback property pub record rights rm show trigger" -- "$cur")
+        "bw clock convert create delay describe doctor echo find graph hosts hz info ls metrics nodes ping pki \
+          play playback property pub record rights rm show trigger" -- "$cur")
       ;;
     property) mapfile -t COMPREPLY < <(compgen -W "get set" -- "$cur") ;;
     playback) mapfile -t COMPREPLY < <(compgen -W "pause reset resume set show" -- "$cur") ;;

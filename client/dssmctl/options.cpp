@@ -860,6 +860,13 @@ void add_all(CLI::App& app, Parsed& parsed) {
   add_clock(app, parsed);
   add_options<DoctorOptions>(
       app.add_subcommand("doctor", "check for what usually goes wrong, and how to fix it"), parsed);
+  add_options<MetricsOptions>(
+      app.add_subcommand("metrics", "what dssmd knows, as OpenMetrics text for Prometheus"), parsed,
+      [](const MetricsOptions& all) {
+        require(!all.json,
+                "--json: metrics are OpenMetrics text; `dssmctl ls --json` and `dssmctl "
+                "hosts --json` have the same as JSON");
+      });
   add_ping(app, parsed);
   add_info(app, parsed);
   add_echo(app, parsed);

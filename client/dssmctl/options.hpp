@@ -60,6 +60,7 @@ struct ClockOptions : CommonOptions {
 };
 
 struct DoctorOptions : CommonOptions {};
+struct MetricsOptions : CommonOptions {};
 
 struct PingOptions : CommonOptions {
   std::string host;
@@ -231,9 +232,9 @@ struct PkiShowOptions : CommonOptions {
 
 using Options =
     std::variant<LsOptions, HostsOptions, NodesOptions, GraphOptions, ClockOptions, DoctorOptions,
-                 PingOptions, InfoOptions, EchoOptions, PubOptions, RecordOptions, TriggerOptions,
-                 PlayOptions, ConvertOptions, FindOptions, ShowOptions, HzOptions, BwOptions,
-                 DelayOptions, CreateOptions, DescribeOptions, RmOptions, RightsOptions,
+                 MetricsOptions, PingOptions, InfoOptions, EchoOptions, PubOptions, RecordOptions,
+                 TriggerOptions, PlayOptions, ConvertOptions, FindOptions, ShowOptions, HzOptions,
+                 BwOptions, DelayOptions, CreateOptions, DescribeOptions, RmOptions, RightsOptions,
                  PropertyGetOptions, PropertySetOptions, PlaybackOptions, PkiInitOptions,
                  PkiRequestOptions, PkiIssueOptions, PkiInstallOptions, PkiRenewOptions,
                  PkiRevokeOptions, PkiShowOptions>;
@@ -257,6 +258,7 @@ Result<void> run(const NodesOptions& options, Output& out);
 Result<void> run(const GraphOptions& options, Output& out);
 Result<void> run(const ClockOptions& options, Output& out);
 Result<void> run(const DoctorOptions& options, Output& out);
+Result<void> run(const MetricsOptions& options, Output& out);
 Result<void> run(const PingOptions& options, Output& out);
 Result<void> run(const InfoOptions& options, Output& out);
 Result<void> run(const EchoOptions& options, Output& out);
