@@ -204,8 +204,8 @@ SSM_tid dssm_ssm_next(SSM_sid sid, SSM_tid tid, int waits) {
   }
 }
 
-// These are called for each sample: all that they call in this library becomes a part of them, which
-// saves a quarter of the time of a small sample.
+// These are called for each sample: all that they call in this library becomes a part of them,
+// which saves a quarter of the time of a small sample.
 [[gnu::flatten]] SSM_tid readSSM(SSM_sid sid, void* data, ssmTimeT* ytime, SSM_tid tid) {
   return read_into(sid, data, ytime, by_tid(tid));
 }
