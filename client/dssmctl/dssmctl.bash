@@ -86,7 +86,7 @@ _dssmctl() {
       --socket | --sort | --host | --at | --count | -n | -c | --field | --wait | --window | \
         --interval | -i | --size | --table | --depth | --life | --cycle | --type | --align | --offset | \
         --speed | --time | --rate | --ca | --credentials | --out | --name | --program | --days | \
-        --output | -o | --past | --until | --for | --compression | --max-file-size | \
+        --output | -o | --past | --span | --until | --for | --compression | --max-file-size | \
         --max-file-duration | --max-total-size | --from | --to | --map | --lockstep | --before | \
         --after | --trigger | --min-interval | --max-incident | --quota | --reason | --config | --repair | \
         --stream)
@@ -151,6 +151,7 @@ _dssmctl() {
     info) options="--watch" ;;
     clock) options="--matrix --table --wait --watch" ;;
     ping) options="--count --interval" ;;
+    plot) options="--for --out --span --wait" ;;
     echo) options="--at --count --csv --field --full --last --wait" ;;
     pub) options="--count --rate --stdin --times" ;;
     play) options="--force --from --lockstep --loop --map --now --on-hosts --rate --start-paused --this-host --to" ;;
@@ -184,7 +185,7 @@ _dssmctl() {
     "" | help)
       mapfile -t COMPREPLY < <(compgen -W \
         "bw clock convert create delay describe doctor echo find graph hosts hz info ls metrics nodes ping pki \
-          play playback property pub record rights rm show trigger" -- "$cur")
+          play playback plot property pub record rights rm show trigger" -- "$cur")
       ;;
     property) mapfile -t COMPREPLY < <(compgen -W "get set" -- "$cur") ;;
     playback) mapfile -t COMPREPLY < <(compgen -W "pause reset resume set show" -- "$cur") ;;

@@ -39,7 +39,7 @@ function __dssmctl_candidates
                 contains -- "$verb" pub play; and set i (math $i + 1)
             case --socket --sort --host --at --count -n -c --field --wait --window --interval -i \
                 --size --table --depth --life --cycle --type --align --offset --speed --time --rate --ca \
-                --credentials --out --name --program --days --output -o --past --until --for \
+                --credentials --out --name --program --days --output -o --past --span --until --for \
                 --compression --max-file-size --max-file-duration --max-total-size --from --to --map \
                 --before --after --trigger --min-interval --max-incident --quota --reason --config \
                 --lockstep --repair --stream

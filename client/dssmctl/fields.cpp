@@ -164,6 +164,18 @@ Result<std::vector<Field>> select_fields(std::vector<Field> fields,
   return fields;
 }
 
+std::optional<FieldElement> find_field(const std::vector<Field>& fields, std::string_view wanted) {
+  for (const Field& field : fields) {
+    if (wanted == field.name) return FieldElement{field, std::nullopt};
+    if (!wanted.starts_with(field.name + "[") || !wanted.ends_with(']')) continue;
+    const std::size_t begin = field.name.size() + 1;
+    const Result<std::uint64_t> number =
+        parse_whole(wanted.substr(begin, wanted.size() - begin - 1), 0, field.count - 1);
+    if (number) return FieldElement{field, *number};
+  }
+  return std::nullopt;
+}
+
 bool is_text(const Field& field) {
   return field.kind == Scalar::character && field.count > 1 && field.stride_bytes == 1;
 }

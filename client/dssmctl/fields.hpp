@@ -10,6 +10,7 @@
 #include <optional>
 #include <span>
 #include <string>
+#include <string_view>
 #include <vector>
 
 #include "client/dssmctl/output.hpp"
@@ -25,6 +26,13 @@ std::vector<Field> readable_fields_untrusted(const TypeInfo& type);
 // naming the fields there are.
 Result<std::vector<Field>> select_fields(std::vector<Field> fields,
                                          const std::vector<std::string>& wanted);
+
+// The field, or the element of it, that `wanted` names: "pose.x", "ranges[3]". Empty: there is none.
+struct FieldElement {
+  Field field;
+  std::optional<std::uint64_t> element;  // empty: the whole field
+};
+std::optional<FieldElement> find_field(const std::vector<Field>& fields, std::string_view wanted);
 
 // Whether the field is text: an array of char without holes. It ends at its first zero byte.
 bool is_text(const Field& field);

@@ -2,11 +2,7 @@
 //
 // dssmctl graph: who gives samples to whom, as a drawing. Graphviz's dot(1) draws it; without --out
 // its input is what is printed.
-#include <fcntl.h>
 #include <fmt/format.h>
-#include <spawn.h>
-#include <sys/wait.h>
-#include <unistd.h>
 
 #include <cerrno>
 #include <fstream>
@@ -14,6 +10,7 @@
 #include <utility>
 
 #include "client/dssmctl/describe.hpp"
+#include "client/dssmctl/draw.hpp"
 #include "client/dssmctl/names.hpp"
 #include "client/dssmctl/nodes.hpp"
 #include "client/dssmctl/open_stream.hpp"
@@ -21,7 +18,6 @@
 #include "client/dssmctl/text.hpp"
 #include "core/base/text.hpp"
 #include "core/base/try.hpp"
-#include "core/base/unique_fd.hpp"
 
 namespace dssm::ctl {
 namespace {
@@ -98,41 +94,6 @@ Result<void> write_file(const std::string& file, const std::string& text) {
   return out ? Result<void>() : cannot_write(file, errno);
 }
 
-// Has dot(1) draw `text` into `file`; what it reports goes to standard error.
-Result<void> draw(const std::string& text, const std::string& format, const std::string& file) {
-  int ends[2];
-  if (::pipe2(ends, O_CLOEXEC)) return os_error("pipe2");
-  UniqueFd from(ends[0]), to(ends[1]);
-  std::string words[] = {"dot", "-T" + format, "-o", file};
-  char* argv[] = {words[0].data(), words[1].data(), words[2].data(), words[3].data(), nullptr};
-  posix_spawn_file_actions_t actions;
-  ::posix_spawn_file_actions_init(&actions);
-  ::posix_spawn_file_actions_adddup2(&actions, from.get(), STDIN_FILENO);
-  pid_t pid = -1;
-  const int failed = ::posix_spawnp(&pid, argv[0], &actions, nullptr, argv, environ);
-  ::posix_spawn_file_actions_destroy(&actions);
-  if (failed == ENOENT) {
-    return Error{Errc::not_found,
-                 fmt::format("draw '{}': there is no program 'dot' here; install Graphviz (`sudo "
-                             "apt install graphviz`), or write a .dot file and draw it elsewhere",
-                             file)};
-  }
-  if (failed) return os_error("run 'dot'", failed);
-  from = UniqueFd();
-  for (std::size_t done = 0; done < text.size();) {
-    const ssize_t wrote = ::write(to.get(), text.data() + done, text.size() - done);
-    if (wrote < 0 && errno != EINTR) break;  // it has ended
-    if (wrote > 0) done += static_cast<std::size_t>(wrote);
-  }
-  to = UniqueFd();
-  int status = 0;
-  while (::waitpid(pid, &status, 0) < 0 && errno == EINTR) {
-  }
-  if (WIFEXITED(status) && WEXITSTATUS(status) == 0) return {};
-  return Error{Errc::system,
-               fmt::format("draw '{}': 'dot' (Graphviz) failed; it says above why", file)};
-}
-
 }  // namespace
 
 std::string dot_text(std::string_view text) {
@@ -177,7 +138,9 @@ Result<void> run(const GraphOptions& options, Output& out) {
     return {};
   }
   if (options.format == "dot") return write_file(options.out, text);
-  return draw(text, options.format, options.out);
+  return draw(options.out, {"dot", "-T" + options.format, "-o", options.out}, text,
+              "install Graphviz (`sudo apt install graphviz`), or write a .dot file and draw it "
+              "elsewhere");
 }
 
 }  // namespace dssm::ctl

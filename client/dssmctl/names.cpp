@@ -54,4 +54,14 @@ bool StreamFilter::takes(const StreamId& id) const {
                      [&](const std::string& pattern) { return is_named(id, pattern); });
 }
 
+std::vector<std::pair<std::string, std::string>> splits_at_dots(const std::string& text) {
+  std::vector<std::pair<std::string, std::string>> parts;
+  for (std::size_t dot = text.find('.'); dot != text.npos; dot = text.find('.', dot + 1)) {
+    if (dot > 0 && dot + 1 < text.size()) {
+      parts.emplace_back(text.substr(0, dot), text.substr(dot + 1));
+    }
+  }
+  return parts;
+}
+
 }  // namespace dssm::ctl

@@ -22,6 +22,10 @@ namespace dssm::ctl {
 std::vector<std::string> opening_names(const std::vector<StreamInfo>& streams,
                                        std::string_view own_host);
 
+// The parts of STREAM.FIELD, where names of streams and of fields may have dots, too: for each of
+// its dots what is before and after it.
+std::vector<std::pair<std::string, std::string>> splits_at_dots(const std::string& text);
+
 // Streams of several hosts that have the same name and id: without the host in its name such a
 // stream opens only on a host that owns one.
 class Duplicates {

@@ -321,6 +321,31 @@ void add_echo(CLI::App& app, Parsed& parsed) {
   add_wait(echo, options.wait);
 }
 
+void add_plot(CLI::App& app, Parsed& parsed) {
+  CLI::App* plot = app.add_subcommand("plot", "draw fields of streams over time");
+  PlotOptions& options = add_options<PlotOptions>(plot, parsed, [](const PlotOptions& all) {
+    require(all.out.empty() || !all.json, "--out and --json: choose one");
+  });
+  plot->add_option("STREAM.FIELD", options.targets,
+                   "one curve for each: odometry.pose.x, lidar.ranges[3]")
+      ->required()
+      ->type_name("...");
+  add_seconds(plot, "--span", "how much time is drawn (default: 10s)", options.span,
+              Range::positive);
+  add_seconds(plot, "--for", "end after so long; with --out: then draw it (default: at once)",
+              options.duration, Range::positive);
+  add_parsed(plot, "--out", "FILE", "the file to write, which ends in .svg or .png (by gnuplot)",
+             [&options](const std::string& text) -> Result<void> {
+               if (text.ends_with(".svg") || text.ends_with(".png")) {
+                 options.out = text;
+                 return {};
+               }
+               return Error{Errc::invalid_argument,
+                            fmt::format("'{}' does not end in .svg or .png", escaped(text))};
+             });
+  add_wait(plot, options.wait);
+}
+
 void check_pub(PubOptions& options) {
   require(options.from_stdin || !options.times,
           "--times: only with --stdin, whose lines have them");
@@ -870,6 +895,7 @@ void add_all(CLI::App& app, Parsed& parsed) {
   add_ping(app, parsed);
   add_info(app, parsed);
   add_echo(app, parsed);
+  add_plot(app, parsed);
   add_pub(app, parsed);
   add_record(app, parsed);
   add_trigger(app, parsed);

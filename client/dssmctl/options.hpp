@@ -88,6 +88,13 @@ struct EchoOptions : ReadingOptions {
   std::vector<std::string> fields;
 };
 
+struct PlotOptions : ReadingOptions {
+  std::vector<std::string> targets;  // STREAM.FIELD
+  Duration span = std::chrono::seconds(10);
+  std::optional<Duration> duration;
+  std::string out;  // the file to write, *.svg or *.png; empty: the terminal
+};
+
 struct PubOptions : CommonOptions {
   std::string stream;
   std::vector<std::string> assignments;  // FIELD=VALUE
@@ -232,12 +239,12 @@ struct PkiShowOptions : CommonOptions {
 
 using Options =
     std::variant<LsOptions, HostsOptions, NodesOptions, GraphOptions, ClockOptions, DoctorOptions,
-                 MetricsOptions, PingOptions, InfoOptions, EchoOptions, PubOptions, RecordOptions,
-                 TriggerOptions, PlayOptions, ConvertOptions, FindOptions, ShowOptions, HzOptions,
-                 BwOptions, DelayOptions, CreateOptions, DescribeOptions, RmOptions, RightsOptions,
-                 PropertyGetOptions, PropertySetOptions, PlaybackOptions, PkiInitOptions,
-                 PkiRequestOptions, PkiIssueOptions, PkiInstallOptions, PkiRenewOptions,
-                 PkiRevokeOptions, PkiShowOptions>;
+                 MetricsOptions, PlotOptions, PingOptions, InfoOptions, EchoOptions, PubOptions,
+                 RecordOptions, TriggerOptions, PlayOptions, ConvertOptions, FindOptions,
+                 ShowOptions, HzOptions, BwOptions, DelayOptions, CreateOptions, DescribeOptions,
+                 RmOptions, RightsOptions, PropertyGetOptions, PropertySetOptions, PlaybackOptions,
+                 PkiInitOptions, PkiRequestOptions, PkiIssueOptions, PkiInstallOptions,
+                 PkiRenewOptions, PkiRevokeOptions, PkiShowOptions>;
 
 // Either options to work with, or a text that ends the program at once: help and version on
 // standard output, an error on standard error.
@@ -259,6 +266,7 @@ Result<void> run(const GraphOptions& options, Output& out);
 Result<void> run(const ClockOptions& options, Output& out);
 Result<void> run(const DoctorOptions& options, Output& out);
 Result<void> run(const MetricsOptions& options, Output& out);
+Result<void> run(const PlotOptions& options, Output& out);
 Result<void> run(const PingOptions& options, Output& out);
 Result<void> run(const InfoOptions& options, Output& out);
 Result<void> run(const EchoOptions& options, Output& out);

@@ -41,18 +41,6 @@ bool is_about(const std::string& pattern, const StreamId& stream) {
   return stream.name != kTriggerStream && StreamFilter({}, {pattern}).takes(stream);
 }
 
-// The parts of STREAM.FIELD, where names of streams and of fields may have dots, too: for each of
-// its dots what is before and after it.
-std::vector<std::pair<std::string, std::string>> parts_of(const std::string& target) {
-  std::vector<std::pair<std::string, std::string>> parts;
-  for (std::size_t dot = target.find('.'); dot != target.npos; dot = target.find('.', dot + 1)) {
-    if (dot > 0 && dot + 1 < target.size()) {
-      parts.emplace_back(target.substr(0, dot), target.substr(dot + 1));
-    }
-  }
-  return parts;
-}
-
 bool is_there(const HostInfo& host) {
   return host.state == HostState::up || host.state == HostState::self;
 }
@@ -105,7 +93,8 @@ Result<TriggerRule> TriggerRule::parse(std::string_view text) {
   const std::size_t at = rest.find(comparison->first);
   rule.compare = comparison->second;
   rule.target = trimmed(rest.substr(0, at));
-  if (parts_of(rule.target).empty() || rule.target.find_first_of("<>=!") != rule.target.npos) {
+  if (splits_at_dots(rule.target).empty() ||
+      rule.target.find_first_of("<>=!") != rule.target.npos) {
     return wrong("STREAM.FIELD is missing");
   }
   if (rule.name.empty()) rule.name = rule.target;
@@ -153,7 +142,7 @@ bool TriggerRule::holds_for(double value) const {
 bool TriggerEvaluator::has_rule_on(const StreamId& stream) const {
   return std::any_of(rules_.begin(), rules_.end(), [&](const TriggerRule& rule) {
     if (rule.kind != Kind::field) return false;
-    const auto parts = parts_of(rule.target);
+    const auto parts = splits_at_dots(rule.target);
     return std::any_of(parts.begin(), parts.end(),
                        [&](const auto& part) { return is_about(part.first, stream); });
   });
@@ -164,21 +153,10 @@ std::vector<TriggerEvaluator::Check> TriggerEvaluator::checks_of(
   std::vector<Check> checks;
   for (std::size_t rule = 0; rule < rules_.size(); ++rule) {
     if (rules_[rule].kind != Kind::field) continue;
-    for (const auto& [pattern, wanted] : parts_of(rules_[rule].target)) {
+    for (const auto& [pattern, wanted] : splits_at_dots(rules_[rule].target)) {
       if (!is_about(pattern, stream)) continue;
-      for (const Field& field : fields) {
-        std::optional<std::uint64_t> element;
-        if (wanted.starts_with(field.name + "[") && wanted.ends_with(']')) {
-          const std::size_t begin = field.name.size() + 1;
-          const Result<std::uint64_t> number =
-              parse_whole(std::string_view(wanted).substr(begin, wanted.size() - begin - 1), 0,
-                          field.count - 1);
-          if (!number) continue;
-          element = *number;
-        } else if (wanted != field.name) {
-          continue;
-        }
-        checks.push_back({rule, field, element, false});
+      if (const auto found = find_field(fields, wanted)) {
+        checks.push_back({rule, found->field, found->element, false});
       }
     }
   }

@@ -100,6 +100,7 @@ class CtlTest : public testing::Test {
 
 std::vector<std::string> lines_of(const std::string& text);
 std::vector<std::string> words_of(const std::string& line);
+std::string text_of(const std::string& file);
 
 // History of `depth` slots.
 inline History depth_of(std::uint64_t depth) { return {depth, std::chrono::milliseconds(10)}; }

@@ -21,12 +21,6 @@ std::string program(const std::string& way) {
   return "exec " + built("tests/process/dssmctl/lockstep-program") + " " + way;
 }
 
-std::string text_of(const std::string& file) {
-  std::ostringstream text;
-  text << std::ifstream(file).rdbuf();
-  return text.str();
-}
-
 class Lockstep : public CtlTest {
  protected:
   // Stream "fast" with samples 0 to 999, one each millisecond, and "slow" with 0 to 99, each 10.

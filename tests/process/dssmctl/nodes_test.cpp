@@ -21,11 +21,6 @@ class Nodes : public FleetTest {
  protected:
   Nodes() { await_streams(1); }
 
-  static std::string text_of(const std::string& path) {
-    std::ostringstream text;
-    text << std::ifstream(path).rdbuf();
-    return text.str();
-  }
   // Runs dssmctl with this as the only, or first, folder of programs.
   Finished with_programs_in(const std::string& path, Strings words) {
     return run(argv(std::move(words)), {daemon_.environment(), "PATH=" + path});
