@@ -171,6 +171,10 @@ struct StreamEvent {
   enum class Kind : std::uint8_t { added, removed };
   Kind kind = Kind::added;
   StreamInfo stream;  // for removed: identity only
+  // Added: the stream was known before, and has another property now, or none
+  // (stream.property_bytes is 0). The samples after stream.newest are written with that one. Changes
+  // that follow each other closely may be reported once.
+  bool property_set = false;
 };
 
 // How a stream is created.
@@ -321,9 +325,10 @@ class Session {
   Result<StreamRights> stream_rights(const StreamId& id);
 
   // Calls `on_event` for each existing stream, then for each one added or removed, until the watch
-  // is destroyed. A stream that is recreated is reported as added again. The calls come from the
-  // session's thread, and from watch() itself: `on_event` must return soon and must not call the
-  // session. After a reconnect only differences are reported.
+  // is destroyed. A stream that is recreated is reported as added again, and so is one whose
+  // property was set (StreamEvent::property_set). The calls come from the session's thread, and
+  // from watch() itself: `on_event` must return soon and must not call the session. After a
+  // reconnect only differences are reported; of a property, only of its length.
   class Watch {
    public:
     Watch(Watch&&) noexcept;
