@@ -188,8 +188,11 @@ class Player {
       show(timeline);
       if (timeline.has_jumped()) DSSM_TRY(follow_jump(timeline.now(), timeline));
       const bool backwards = timeline.speed() < 0;
-      if (!backwards) DSSM_TRY(set_late_properties(timeline.now()));
       const RecordedSample* const next = course_.peek(backwards);
+      if (!backwards) {
+        const Time now = timeline.now();
+        DSSM_TRY(set_late_properties(next ? std::min(now, next->info.time) : now));
+      }
       const Time end = backwards ? range_.from : range_.to;
       const Duration rest =
           timeline.is_paused() ? Duration::max() : timeline.until(next ? next->info.time : end);
@@ -323,6 +326,7 @@ class Player {
 
   // A property comes with the first sample that has it. Where no sample of the stream comes for a
   // while, it comes without one; samples that were recorded late are not that late.
+  //   now  at most the time of the next sample
   Result<void> set_late_properties(Time now) {
     const Time due = saturating_add(now, -kPropertyWait);
     for (const std::size_t i : changing_) {
