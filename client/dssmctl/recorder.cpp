@@ -12,12 +12,6 @@
 namespace dssm::ctl {
 namespace {
 
-// Empty when there is none, or its host does not answer.
-std::vector<std::byte> property_of(const RawReader& reader) {
-  Result<std::vector<std::byte>> property = reader.property();
-  return property ? *std::move(property) : std::vector<std::byte>();
-}
-
 // Of sample `tid`, or of the next one that is there; empty: there is none yet.
 std::optional<Time> time_from_tid(const RawReader& reader, Tid tid) {
   SampleInfo info;
@@ -223,11 +217,14 @@ Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
   // A stream that comes later is new, or its host is: all of it is wanted.
   const bool with_history = plan_.past || plan_.on_demand || !wanted.from_start;
   Session session = session_;
+  // Before there is a reader: what is set from then on is reported, with the sample. Empty when
+  // there is none, or its host does not answer.
+  Result<std::vector<std::byte>> property = session.property(wanted.stream.id);
   RawReader reader = DSSM_TRY(
       session.open_raw_reader(wanted.stream.id, nullptr, 0,
                               with_history ? FetchHistory::at_once : FetchHistory::when_read));
   Source source{std::move(reader), 0, kNoTid, kNoTid, {}, true, {}, {}};
-  source.property = property_of(source.reader);
+  if (property) source.property = *std::move(property);
   const Tid newest = source.reader.newest_tid();
   // The stamps of a recording that is being played are of another time than now.
   source.is_of_now = wanted.stream.state != StreamState::unknown;

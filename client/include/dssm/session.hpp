@@ -345,7 +345,7 @@ class Session {
 
   // --- properties
 
-  // A constant block of bytes attached to a stream, which need not be open. At most 1 MiB, or the
+  // A block of bytes attached to a stream, which need not be open. At most 1 MiB, or the
   // limit that dssmd is configured with; 0 bytes remove it.
   //   fails  not_found (no such stream; property() also: none set), limit_exceeded, conflict
   Result<void> set_property(const StreamId& id, std::span<const std::byte> property);
