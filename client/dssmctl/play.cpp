@@ -210,9 +210,7 @@ class Player {
       } else if (options_.loop) {
         DSSM_TRY(begin(timeline, timeline.speed(), timeline.is_paused()));
       } else {
-        // Those after the last sample, too.
-        const Time end_of_all = options_.to ? range_.to : Time::max();
-        DSSM_TRY(set_properties(backwards ? range_.from : end_of_all));
+        if (!backwards) DSSM_TRY(set_last_properties());
         break;
       }
     }
@@ -234,6 +232,7 @@ class Player {
       course_.taken();
       if (!DSSM_TRY(lockstep.settle())) return {};
     }
+    DSSM_TRY(set_last_properties());
     return lockstep.finish();
   }
 
@@ -322,6 +321,11 @@ class Player {
     }
     for (const auto& [target, i] : streams) DSSM_TRY(set_property(i, t));
     return {};
+  }
+
+  // At the end of what is played: also those that were set after the last sample.
+  Result<void> set_last_properties() {
+    return set_properties(options_.to ? range_.to : Time::max());
   }
 
   // A property comes with the first sample that has it. Where no sample of the stream comes for a

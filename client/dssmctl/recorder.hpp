@@ -115,7 +115,7 @@ class Recorder {
   // What a stream got as its property while it was open.
   struct NewProperty {
     std::uint64_t incarnation = 0;
-    // The newest sample when it was set; kNoTid: there was none. Empty: it is not known when it was.
+    // The newest sample when it was set; kNoTid: there was none. Empty: that is not known.
     std::optional<Tid> after;
     std::vector<std::byte> bytes;    // none: it has none any more
     Time newest_time = Time::min();  // of all samples in the file when it came here

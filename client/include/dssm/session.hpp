@@ -171,8 +171,8 @@ struct StreamEvent {
   enum class Kind : std::uint8_t { added, removed };
   Kind kind = Kind::added;
   StreamInfo stream;  // for removed: identity only
-  // Added: the stream was known before, and has another property now, or none
-  // (stream.property_bytes is 0). The samples after stream.newest are written with that one. Changes
+  // Added: the stream was known before, and its property was set, or removed (then
+  // stream.property_bytes is 0). Samples after stream.newest are written with the new one. Changes
   // that follow each other closely may be reported once.
   bool property_set = false;
 };
@@ -328,7 +328,7 @@ class Session {
   // is destroyed. A stream that is recreated is reported as added again, and so is one whose
   // property was set (StreamEvent::property_set). The calls come from the session's thread, and
   // from watch() itself: `on_event` must return soon and must not call the session. After a
-  // reconnect only differences are reported; of a property, only of its length.
+  // reconnect only differences are reported; a property differs if its length does.
   class Watch {
    public:
     Watch(Watch&&) noexcept;
