@@ -776,17 +776,24 @@ class RecordFleet : public FleetTest {
 
 TEST_F(RecordFleet, HasThePropertiesOfStreamsOfOtherHosts) {
   const std::string file = folder_.file("a.mcap");
-  auto there = on_pc2_.create<RecordedPose>("pose", depth_of(64)).value();
+  auto there = on_pc2_.create<RecordedPose>("pose", depth_of(4096)).value();
   await_streams(1);
   Running running(argv({"record", "-o", file}), environment());
-  await([&] { return session_.stream_info(there.id()).value().readers >= 1; });
-  write_poses(there, 0, 9);
+  std::int64_t next = 0;  // sample; of which the first ones are before the recording
+  await([&] {
+    write_poses(there, next, next);
+    ++next;
+    const Result<Recording> recording = Recording::open(file);
+    return recording && !recording->streams().empty() && recording->streams()[0].samples > 0;
+  });
   ASSERT_TRUE(there.set_property(bytes_of("calibrated")));
-  write_poses(there, 10, 19);
-  await([&] { return properties_in(file, "pose").size() == 1; });
+  write_poses(there, next, next + 9);
+  await([&] { return !properties_in(file, "pose").empty(); });
   running.signal(SIGINT);
   EXPECT_EQ(running.status(), 0);
-  EXPECT_EQ(properties_in(file, "pose"), std::vector<std::string>{"10 calibrated"});
+  const Recording recording = Recording::open(file).value();
+  EXPECT_EQ(recording.streams()[0].property_times, std::vector{at_ns(kSecond + next * 1'000'000)});
+  EXPECT_EQ(recording.property(0, 0).value(), bytes_of("calibrated"));
 }
 
 TEST_F(RecordFleet, PlaysHereWhatAnotherHostWritesNow) {
