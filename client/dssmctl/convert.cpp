@@ -36,17 +36,24 @@ struct Converted {
 
 // --- to MCAP
 
-// Writes samples; of tids that are missing, a gap.
+// Writes samples and properties; of tids that are missing, a gap.
 class McapOutput {
  public:
-  McapOutput(RecordingWriter file, std::size_t streams) : file_(std::move(file)), last_(streams) {}
+  McapOutput(RecordingWriter file, const Recording& recording)
+      : file_(std::move(file)),
+        recording_(recording),
+        numbers_(recording.streams().size()),
+        properties_(recording.streams().size()),
+        last_(recording.streams().size()) {}
 
-  Result<void> add(std::size_t stream, const RecordedStream& about) {
-    numbers_.resize(std::max(numbers_.size(), stream + 1));
+  Result<void> add(std::size_t stream) {
+    RecordedStream about = recording_.streams()[stream];
+    about.property.clear();
     numbers_[stream] = DSSM_TRY(file_.add_stream(about));
     return {};
   }
   Result<void> write(const RecordedSample& sample) {
+    DSSM_TRY(write_properties(sample.stream, sample.info.time));
     const std::uint32_t number = *numbers_[sample.stream];
     std::optional<Tid>& last = last_[sample.stream];
     if (const Tid next = last.value_or(sample.info.tid - 1) + 1; next < sample.info.tid) {
@@ -55,14 +62,30 @@ class McapOutput {
     last = sample.info.tid;
     return file_.write(number, sample.info, sample.clock_error, sample.payload);
   }
-  bool takes(std::size_t stream) const {
-    return stream < numbers_.size() && numbers_[stream].has_value();
+  bool takes(std::size_t stream) const { return numbers_[stream].has_value(); }
+  Result<void> finish() {
+    for (std::size_t stream = 0; stream < numbers_.size(); ++stream) {
+      if (takes(stream)) DSSM_TRY(write_properties(stream, Time::max()));
+    }
+    return file_.finish();
   }
-  Result<void> finish() { return file_.finish(); }
 
  private:
+  // Those that the stream got up to `t`.
+  Result<void> write_properties(std::size_t stream, Time t) {
+    const std::vector<Time>& times = recording_.streams()[stream].property_times;
+    std::size_t& next = properties_[stream];
+    for (; next < times.size() && times[next] <= t; ++next) {
+      const std::vector<std::byte> property = DSSM_TRY(recording_.property(stream, next));
+      DSSM_TRY(file_.set_property(*numbers_[stream], property, times[next]));
+    }
+    return {};
+  }
+
   RecordingWriter file_;
+  const Recording& recording_;
   std::vector<std::optional<std::uint32_t>> numbers_;  // of each stream of the recording
+  std::vector<std::size_t> properties_;                // how many are written
   std::vector<std::optional<Tid>> last_;
 };
 
@@ -192,9 +215,8 @@ class Converter {
   Result<Converted> to_mcap() {
     RecordingOptions how;
     how.compression = compression_of(options_.compression);
-    McapOutput file(DSSM_TRY(RecordingWriter::create(options_.out, how)),
-                    recording_.streams().size());
-    for (const std::size_t i : wanted_) DSSM_TRY(file.add(i, info(i)));
+    McapOutput file(DSSM_TRY(RecordingWriter::create(options_.out, how)), recording_);
+    for (const std::size_t i : wanted_) DSSM_TRY(file.add(i));
     Converted done{{options_.out}};
     RecordingCursor cursor = recording_.cursor();
     for (RecordedSample sample; cursor.next(sample);) {

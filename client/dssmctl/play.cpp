@@ -129,24 +129,36 @@ class Player {
     const DaemonInfo daemon = DSSM_TRY(session_.daemon_info());
     own_host_ = daemon.host;
     const StreamFilter filter({}, options_.patterns);
-    std::map<std::string, std::string> sources;  // by the name here
-    for (const RecordedStreamInfo& stream : recording_.streams()) {
+    struct Source {
+      std::string name;
+      std::size_t stream;
+    };
+    std::map<std::string, Source> sources;  // by the name here
+    const std::vector<RecordedStreamInfo>& streams = recording_.streams();
+    properties_.resize(streams.size());
+    for (std::size_t i = 0; i < streams.size(); ++i) {
+      const RecordedStreamInfo& stream = streams[i];
       writers_.emplace_back();
+      targets_.push_back(i);
       if (!filter.takes(stream.id)) continue;
       const StreamId id = DSSM_TRY(target_of(stream.id));
-      const auto [entry, is_new] = sources.emplace(id.str(), stream.id.str());
-      if (!is_new && entry->second != stream.id.str()) {
+      const auto [entry, is_new] = sources.emplace(id.str(), Source{stream.id.str(), i});
+      if (!is_new && entry->second.name != stream.id.str()) {
         return Error{Errc::invalid_argument,
                      fmt::format("'{}' and '{}' are both to be played as '{}'; --map {}=OTHER "
                                  "renames one",
-                                 escaped(entry->second), escaped(stream.id.str()),
+                                 escaped(entry->second.name), escaped(stream.id.str()),
                                  escaped(short_name(id)), escaped(stream.id.str()))};
       }
       writers_.back() = DSSM_TRY(writer_for(id, stream, is_new));
+      targets_.back() = entry->second.stream;
+      if (!stream.property_times.empty() && stream.property_times.back() != Time::min()) {
+        changing_.push_back(i);
+      }
       is_any_ = true;
     }
     if (!is_any_) return Error{Errc::not_found, "no stream of the recording fits"};
-    return {};
+    return set_properties(options_.rate < 0 ? range_.to : range_.from);
   }
 
   // Says which other streams of this PC programs may find with samples of before.
@@ -171,12 +183,16 @@ class Player {
       out_.add(kKeys);
       shows_now_ = true;
     }
-    begin(timeline, options_.rate, options_.start_paused);
+    DSSM_TRY(begin(timeline, options_.rate, options_.start_paused));
     while (!out_.must_stop()) {
       show(timeline);
       if (timeline.has_jumped()) DSSM_TRY(follow_jump(timeline.now(), timeline));
       const bool backwards = timeline.speed() < 0;
       const RecordedSample* const next = course_.peek(backwards);
+      if (!backwards) {
+        const Time now = timeline.now();
+        DSSM_TRY(set_late_properties(next ? std::min(now, next->info.time) : now));
+      }
       const Time end = backwards ? range_.from : range_.to;
       const Duration rest =
           timeline.is_paused() ? Duration::max() : timeline.until(next ? next->info.time : end);
@@ -187,13 +203,14 @@ class Player {
           DSSM_TRY(follow(*key, timeline));
         }
       } else if (next) {
-        DSSM_TRY(write(*next, timeline.stamp(next->info.time)));
+        DSSM_TRY(play(*next, timeline.stamp(next->info.time)));
         course_.taken();
       } else if (played_ == 0) {
         return Error{Errc::not_found, "no sample of these streams is in that part"};
       } else if (options_.loop) {
-        begin(timeline, timeline.speed(), timeline.is_paused());
+        DSSM_TRY(begin(timeline, timeline.speed(), timeline.is_paused()));
       } else {
+        if (!backwards) DSSM_TRY(set_last_properties());
         break;
       }
     }
@@ -211,10 +228,11 @@ class Player {
     while (const RecordedSample* const next = course_.peek(false)) {
       show(next->info.time);
       if (!DSSM_TRY(lockstep.advance(next->info.time, set_clock))) return {};
-      DSSM_TRY(write(*next, next->info.time));
+      DSSM_TRY(play(*next, next->info.time));
       course_.taken();
       if (!DSSM_TRY(lockstep.settle())) return {};
     }
+    DSSM_TRY(set_last_properties());
     return lockstep.finish();
   }
 
@@ -233,6 +251,17 @@ class Player {
   }
 
  private:
+  static constexpr Duration kPropertyWait = std::chrono::seconds(1);
+
+  // What a stream here has: from which stream of the recording, and the index there; without an
+  // index none from the recording.
+  struct Property {
+    std::size_t stream = SIZE_MAX;
+    std::optional<std::size_t> index;
+
+    friend bool operator==(const Property&, const Property&) = default;
+  };
+
   // Its name here, with a host.
   Result<StreamId> target_of(const StreamId& id) const {
     StreamId target = id;
@@ -261,10 +290,61 @@ class Player {
       DSSM_TRY(session_.remove(existing->id));
     }
     const History history{std::max(stream.depth, kMinDepth), stream.cycle};
-    RawWriter writer =
-        DSSM_TRY(session_.create_raw(id, stream.type, history, {.keep_existing = true}));
-    if (!stream.property.empty()) DSSM_TRY(session_.set_property(writer.id(), stream.property));
-    return writer;
+    return session_.create_raw(id, stream.type, history, {.keep_existing = true});
+  }
+
+  // --- properties
+
+  // Has the stream that is played from stream `from` of the recording get the property that it had
+  // at `t`. One that it has from elsewhere stays until the recording has one.
+  Result<void> set_property(std::size_t from, Time t) {
+    Property& set = properties_[targets_[from]];
+    const Property wanted{from, recording_.streams()[from].property_at(t)};
+    if (wanted.index && wanted != set) {
+      const std::vector<std::byte> property = DSSM_TRY(recording_.property(from, *wanted.index));
+      DSSM_TRY(session_.set_property(writers_[from]->id(), property));
+    } else if (!wanted.index && set.index) {
+      DSSM_TRY(session_.set_property(writers_[from]->id(), {}));
+    }
+    set = wanted;
+    return {};
+  }
+
+  // All streams get what they had at `t`; one that restarted, in the incarnation that it had then.
+  Result<void> set_properties(Time t) {
+    std::map<std::size_t, std::size_t> streams;  // by target
+    for (std::size_t i = 0; i < writers_.size(); ++i) {
+      if (!writers_[i]) continue;
+      const RecordedStreamInfo& stream = recording_.streams()[i];
+      if (stream.samples > 0 && stream.first_time <= t) streams[targets_[i]] = i;
+      streams.try_emplace(targets_[i], i);
+    }
+    for (const auto& [target, i] : streams) DSSM_TRY(set_property(i, t));
+    return {};
+  }
+
+  // At the end of what is played: also those that were set after the last sample.
+  Result<void> set_last_properties() {
+    return set_properties(options_.to ? range_.to : Time::max());
+  }
+
+  // A property comes with the first sample that has it. Where no sample of the stream comes for a
+  // while, it comes without one; samples that were recorded late are not that late.
+  //   now  at most the time of the next sample
+  Result<void> set_late_properties(Time now) {
+    const Time due = saturating_add(now, -kPropertyWait);
+    for (const std::size_t i : changing_) {
+      const Property& set = properties_[targets_[i]];
+      if (set.stream != i || recording_.streams()[i].property_at(due) <= set.index) continue;
+      DSSM_TRY(set_property(i, due));
+    }
+    return {};
+  }
+
+  // Writes the sample, with the property that its stream had then.
+  Result<void> play(const RecordedSample& sample, Time stamp) {
+    DSSM_TRY(set_property(sample.stream, sample.info.time));
+    return write(sample, stamp);
   }
 
   Result<void> write(const RecordedSample& sample, Time stamp) {
@@ -283,17 +363,20 @@ class Player {
 
   // --- by the timeline
 
-  void begin(Timeline& timeline, double rate, bool paused) {
+  Result<void> begin(Timeline& timeline, double rate, bool paused) {
     const bool backwards = rate < 0;
     course_.seek(backwards ? saturating_add(range_.to, Duration(1)) : range_.from);
     last_stepped_.reset();
-    timeline.start(backwards ? range_.to : range_.from, rate, paused);
+    const Time start = backwards ? range_.to : range_.from;
+    timeline.start(start, rate, paused);
+    return set_properties(start);
   }
 
   // The time was set: programs get what the streams had then, as if all had been played so far.
   Result<void> follow_jump(Time time, const Timeline& timeline) {
     course_.seek(saturating_add(time, Duration(1)));
     last_stepped_.reset();
+    DSSM_TRY(set_properties(time));
     std::set<std::string> done;  // a stream that restarted is several
     std::vector<std::byte> payload;
     for (std::size_t i = 0; i < writers_.size(); ++i) {
@@ -368,7 +451,7 @@ class Player {
     if (!next) return timeline.set_paused(true), Result<void>();
     const Time time = next->info.time;
     timeline.start(time, timeline.speed(), true);
-    DSSM_TRY(write(*next, timeline.stamp(time)));
+    DSSM_TRY(play(*next, timeline.stamp(time)));
     course_.taken();
     last_stepped_ = {backwards, time};
     shows_now_ = true;
@@ -399,6 +482,9 @@ class Player {
   Keyboard keyboard_;
   std::string own_host_;
   std::vector<std::optional<RawWriter>> writers_;  // of each stream of the recording
+  std::vector<std::size_t> targets_;   // the same: of those with one name here, the first one
+  std::vector<Property> properties_;   // by target: what it has
+  std::vector<std::size_t> changing_;  // streams whose property changes
   Course course_;
   std::optional<std::pair<bool, Time>> last_stepped_;  // backwards, and to which time
   bool is_any_ = false;

@@ -12,11 +12,16 @@
 namespace dssm::ctl {
 namespace {
 
-// Empty when there is none, or its host does not answer.
-std::vector<std::byte> property_of(const RawReader& reader) {
-  Result<std::vector<std::byte>> property = reader.property();
-  return property ? *std::move(property) : std::vector<std::byte>();
+// Of sample `tid`, or of the next one that is there; empty: there is none yet.
+std::optional<Time> time_from_tid(const RawReader& reader, Tid tid) {
+  SampleInfo info;
+  for (tid = std::max(tid, reader.oldest_tid()); tid <= reader.newest_tid(); ++tid) {
+    if (reader.read_info(tid, info) == ReadStatus::ok) return info.time;
+  }
+  return std::nullopt;
 }
+
+Time after(Time time) { return saturating_add(time, Duration(1)); }
 
 }  // namespace
 
@@ -63,6 +68,14 @@ bool Recorder::Opener::wants(const StreamInfo& stream) const {
 void Recorder::Opener::on_event(const StreamEvent& event) {
   const std::string name = event.stream.id.str();
   const std::lock_guard lock(mutex_);
+  if (event.kind == StreamEvent::Kind::added && wants(event.stream)) {
+    if (event.property_set) {
+      want_property({event.stream, event.stream.newest, MonoClock::now()});
+    } else if (known_.contains(name) && event.stream.property_bytes > 0) {
+      // Its host is there again, or it was created again: the reader goes on by itself.
+      want_property({event.stream, std::nullopt, MonoClock::now()});
+    }
+  }
   const auto is_it = [&](const Wanted& wanted) { return wanted.stream.id == event.stream.id; };
   std::erase_if(removed_, [&](const auto& entry) { return entry.first == event.stream.id; });
   if (event.kind == StreamEvent::Kind::removed) {
@@ -81,6 +94,38 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
   untried_ += is_beginning_;
   wanted_.push_back({event.stream, MonoClock::now(), is_beginning_, false});
   changed_.notify_one();
+}
+
+void Recorder::Opener::want_property(SetProperty wanted) {
+  std::erase_if(set_properties_,
+                [&](const SetProperty& earlier) { return earlier.stream.id == wanted.stream.id; });
+  set_properties_.push_back(std::move(wanted));
+  changed_.notify_one();
+}
+
+void Recorder::Opener::fetch_property(std::unique_lock<std::mutex>& lock,
+                                      const SetProperty& wanted) {
+  lock.unlock();
+  const StreamInfo& stream = wanted.stream;
+  NewProperty property{stream.incarnation, wanted.after, {}, {}, {}};
+  std::optional<Error> error;
+  if (stream.property_bytes > 0) {
+    Result<std::vector<std::byte>> bytes = session_.property(stream.id);
+    if (bytes) {
+      property.bytes = *std::move(bytes);
+    } else {
+      error = std::move(bytes).error();
+    }
+  }
+  lock.lock();
+  if (!error) {
+    properties_.emplace_back(stream.id, std::move(property));
+  } else if (is_retryable(error->code) && !stop_at_ &&
+             std::ranges::none_of(set_properties_, [&](const SetProperty& later) {
+               return later.stream.id == stream.id;
+             })) {
+    want_property({stream, wanted.after, deadline_in(kRetryPeriod)});
+  }
 }
 
 std::vector<Recorder::Opener::Wanted>::iterator Recorder::Opener::next_wanted() {
@@ -120,13 +165,23 @@ void Recorder::Opener::run() {
   std::unique_lock lock(mutex_);
   while (true) {
     const auto next = next_wanted();
-    if (stop_at_ && (next == wanted_.end() || MonoClock::now() >= *stop_at_)) return;
-    if (next == wanted_.end()) {
+    const auto property = std::ranges::min_element(set_properties_, {}, &SetProperty::due);
+    const bool is_stream = next != wanted_.end(), is_property = property != set_properties_.end();
+    if (stop_at_ && ((!is_stream && !is_property) || MonoClock::now() >= *stop_at_)) return;
+    if (!is_stream && !is_property) {
       changed_.wait(lock);
       continue;
     }
-    if (next->due > MonoClock::now()) {
-      changed_.wait_until(lock, next->due);
+    const MonoTime due = std::min(is_stream ? next->due : MonoTime::max(),
+                                  is_property ? property->due : MonoTime::max());
+    if (due > MonoClock::now()) {
+      changed_.wait_until(lock, due);
+      continue;
+    }
+    if (is_property && property->due == due) {
+      const SetProperty wanted_property = std::move(*property);
+      set_properties_.erase(property);
+      fetch_property(lock, wanted_property);
       continue;
     }
     const Wanted wanted = *next;
@@ -162,11 +217,14 @@ Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
   // A stream that comes later is new, or its host is: all of it is wanted.
   const bool with_history = plan_.past || plan_.on_demand || !wanted.from_start;
   Session session = session_;
+  // Before there is a reader: what is set from then on is reported, with the sample. Empty when
+  // there is none, or its host does not answer.
+  Result<std::vector<std::byte>> property = session.property(wanted.stream.id);
   RawReader reader = DSSM_TRY(
       session.open_raw_reader(wanted.stream.id, nullptr, 0,
                               with_history ? FetchHistory::at_once : FetchHistory::when_read));
-  Source source{std::move(reader), 0, kNoTid, kNoTid, {}, true, {}};
-  source.property = property_of(source.reader);
+  Source source{std::move(reader), 0, kNoTid, kNoTid, {}, true, {}, {}};
+  if (property) source.property = *std::move(property);
   const Tid newest = source.reader.newest_tid();
   // The stamps of a recording that is being played are of another time than now.
   source.is_of_now = wanted.stream.state != StreamState::unknown;
@@ -189,6 +247,11 @@ Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
 std::vector<Recorder::Source> Recorder::Opener::take_opened() {
   const std::lock_guard lock(mutex_);
   return std::exchange(opened_, {});
+}
+
+std::vector<std::pair<StreamId, Recorder::NewProperty>> Recorder::Opener::take_properties() {
+  const std::lock_guard lock(mutex_);
+  return std::exchange(properties_, {});
 }
 
 std::vector<std::string> Recorder::Opener::take_notices() {
@@ -216,6 +279,7 @@ Result<std::unique_ptr<Recorder>> Recorder::start(Session session,
 Result<void> Recorder::begin(RecordingWriter file, Duration before) {
   file_ = std::move(file);
   is_recording_ = true;
+  newest_time_ = Time::min();
   wanted_from_ = WallClock::now();
   before_ = before;
   past_moved_ = MonoClock::now();
@@ -251,7 +315,9 @@ Result<void> Recorder::end() {
 }
 
 Result<void> Recorder::take() {
+  auto properties = opener_.take_properties();
   for (Source& opened : opener_.take_opened()) DSSM_TRY(add(std::move(opened)));
+  for (auto& [id, property] : properties) add_property(id, std::move(property));
   if (!is_recording_) {
     check_readers();
     next_take_ = deadline_in(kMaxPeriod);
@@ -272,6 +338,7 @@ Result<void> Recorder::take() {
   is_more_ = false;
   for (Source& source : sources_) {
     if (DSSM_TRY(take(source, until))) is_more_ = true;
+    DSSM_TRY(write_properties(source, false));
   }
   next_take_ = is_more_ ? MonoClock::now() : deadline_in(next_period());
   return {};
@@ -310,6 +377,55 @@ Result<void> Recorder::add_to_file(Source& source) {
   return {};
 }
 
+void Recorder::add_property(const StreamId& id, NewProperty property) {
+  const auto source =
+      std::ranges::find_if(sources_, [&](const Source& one) { return one.reader.id() == id; });
+  if (source == sources_.end()) return;
+  if (!property.after) {
+    const bool is_here = property.incarnation == source->reader.incarnation();
+    property.after = is_here ? source->reader.newest_tid() : kNoTid;
+  }
+  property.newest_time = newest_time_;
+  property.came = MonoClock::now();
+  std::vector<NewProperty>& all = source->new_properties;
+  // Its ring has been replaced since.
+  std::erase_if(all, [&](const NewProperty& earlier) {
+    return earlier.incarnation != property.incarnation &&
+           earlier.incarnation != source->reader.incarnation();
+  });
+  all.push_back(std::move(property));
+}
+
+Result<void> Recorder::write_properties(Source& source, bool all) {
+  const RawReader& reader = source.reader;
+  std::vector<NewProperty>& properties = source.new_properties;
+  while (!properties.empty()) {
+    NewProperty& next = properties.front();
+    if (next.incarnation != reader.incarnation()) {
+      // The reader has yet to follow to that ring, or has left it.
+      const bool is_old = std::ranges::any_of(properties, [&](const NewProperty& later) {
+        return later.incarnation == reader.incarnation();
+      });
+      if (!is_old) break;
+      properties.erase(properties.begin());
+      continue;
+    }
+    Time from = Time::min();
+    if (*next.after != kNoTid) {
+      const std::optional<Time> first = time_from_tid(reader, *next.after + 1);
+      if (!first && !all && MonoClock::now() - next.came < kPropertyWait) break;
+      const std::optional<Time> last = time_from_tid(reader, reader.newest_tid());
+      from = first ? *first : std::max(next.newest_time, last ? after(*last) : Time::min());
+    }
+    if (next.bytes != source.property) {
+      DSSM_TRY(file_->set_property(source.number, next.bytes, from));
+      source.property = std::move(next.bytes);
+    }
+    properties.erase(properties.begin());
+  }
+  return {};
+}
+
 std::optional<Time> Recorder::next_past(const Source& source) {
   if (source.next > source.past_until) return std::nullopt;
   SampleInfo info;
@@ -325,9 +441,20 @@ void Recorder::follow_restart(Source& source) {
   const Tid cursor = reader.cursor();
   BorrowedSample newest;
   if (reader.borrow(reader.newest_tid(), newest) == ReadStatus::restarted) {
-    source.property = property_of(reader);
+    source.property.clear();  // dssmd reports the one that it has
   } else {
     reader.seek(cursor);
+  }
+}
+
+// Those that all samples in the ring have are the past of it.
+void Recorder::forget_properties(Source& source) {
+  std::vector<NewProperty>& properties = source.new_properties;
+  while (!properties.empty() && properties.front().incarnation == source.reader.incarnation() &&
+         (*properties.front().after < source.reader.oldest_tid() ||
+          properties.size() > kMaxKeptProperties)) {
+    source.property = std::move(properties.front().bytes);
+    properties.erase(properties.begin());
   }
 }
 
@@ -342,7 +469,10 @@ void Recorder::check_readers() {
     }
   }
   std::erase_if(sources_, [&](Source& source) {
-    if (!is_recording_) follow_restart(source);
+    if (!is_recording_) {
+      follow_restart(source);
+      forget_properties(source);
+    }
     const std::optional<Error> error = source.reader.restart_error();
     if (error) opener_.reopen(source.reader.id(), *error);
     return error.has_value();
@@ -360,8 +490,7 @@ Result<bool> Recorder::take(Source& source, std::optional<Time> until) {
     SampleInfo info;
     const ReadStatus status = source.reader.read_next(payload_, info);
     if (status == ReadStatus::restarted) {
-      // Its property is asked for at the end: dssmd may take its time to answer.
-      source.property.clear();
+      source.property.clear();  // dssmd reports the one that it has
       DSSM_TRY(add_to_file(source));
       source.next = 0;
       source.past_until = kNoTid;
@@ -388,6 +517,7 @@ Result<void> Recorder::write(Source& source, const SampleInfo& info) {
                             static_cast<std::uint64_t>(info.tid - source.next)));
   }
   source.next = info.tid + 1;
+  newest_time_ = std::max(newest_time_, info.time);
   return file_->write(source.number, info, source.reader.clock_error(info),
                       std::span(payload_).first(info.payload_bytes));
 }
@@ -420,14 +550,18 @@ Result<void> Recorder::complete() {
   do {
     taken = take();
   } while (taken && is_more_ && MonoClock::now() < end);  // writers may be faster
-  // A program may have set it after its stream was opened here.
+  // One that was set just now is not reported yet.
   for (Source& source : sources_) {
+    if (!taken) break;
+    const RawReader& reader = source.reader;
     // A host that is lost must not keep the next file waiting.
-    if (!taken || (is_on_demand_ && MonoClock::now() >= end)) break;
-    Result<std::vector<std::byte>> property = source.reader.property();
-    if (!property) continue;
-    source.property = *std::move(property);
-    taken = file_->set_property(source.number, source.property);
+    if (!is_on_demand_ || MonoClock::now() < end) {
+      if (Result<std::vector<std::byte>> property = reader.property()) {
+        source.new_properties.push_back(
+            {reader.incarnation(), reader.newest_tid(), *std::move(property), newest_time_, {}});
+      }
+    }
+    taken = write_properties(source, true);
   }
   Result<void> finished = file_->finish();
   return taken ? finished : taken;

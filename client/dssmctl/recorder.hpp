@@ -6,7 +6,8 @@
 // The rings are looked at so often that none of them is filled more than by a part in between:
 // which costs less than a wake-up for each sample, and a recording is in no hurry. Streams are
 // opened and their properties asked for by a thread of its own, so that a host that does not answer
-// costs no samples of the others.
+// costs no samples of the others. dssmd reports that a property was set, with the tid of the newest
+// sample then: so the recording has it from the right sample on, whichever it reads first.
 #pragma once
 
 #include <condition_variable>
@@ -106,6 +107,20 @@ class Recorder {
   static constexpr Duration kPastPart = std::chrono::milliseconds(100);
   // What one stream may have taken before the others have their turn.
   static constexpr std::uint64_t kTurnBytes = 4U << 20;
+  // So long a property waits for its first sample, whose time is its own in the file.
+  static constexpr Duration kPropertyWait = std::chrono::seconds(1);
+  // Of one stream, while there is no file.
+  static constexpr std::size_t kMaxKeptProperties = 64;
+
+  // What a stream got as its property while it was open.
+  struct NewProperty {
+    std::uint64_t incarnation = 0;
+    // The newest sample when it was set; kNoTid: there was none. Empty: that is not known.
+    std::optional<Tid> after;
+    std::vector<std::byte> bytes;    // none: it has none any more
+    Time newest_time = Time::min();  // of all samples in the file when it came here
+    MonoTime came{};
+  };
 
   // A stream that is recorded.
   struct Source {
@@ -115,7 +130,8 @@ class Recorder {
     Tid past_until = kNoTid;          // the newest at its opening, if history is wanted
     std::optional<Time> from;         // samples before that are not wanted
     bool is_of_now = true;            // its stamps are of this time, and not of one that is played
-    std::vector<std::byte> property;  // when it was asked for last
+    std::vector<std::byte> property;  // that the file has, or gets at its beginning
+    std::vector<NewProperty> new_properties;  // the file has not yet
   };
   static Time past_of(const Source& source, Time now, Duration past);
 
@@ -138,6 +154,8 @@ class Recorder {
     void reopen(const StreamId& id, const Error& error);
 
     std::vector<Source> take_opened();
+    // To be called before take_opened(), which then has their streams.
+    std::vector<std::pair<StreamId, NewProperty>> take_properties();
     std::vector<std::string> take_notices();
     bool has_tried_all() const;  // of the streams that there were at begin()
 
@@ -148,6 +166,14 @@ class Recorder {
       bool from_start = false;  // it was there at begin()
       bool reported = false;
     };
+    // A property to be fetched, of a stream as the event describes it.
+    struct SetProperty {
+      StreamInfo stream;
+      std::optional<Tid> after;  // as in NewProperty
+      MonoTime due{};
+    };
+    void want_property(SetProperty wanted);
+    void fetch_property(std::unique_lock<std::mutex>& lock, const SetProperty& wanted);
     // The one to try next; the end: none.
     std::vector<Wanted>::iterator next_wanted();
     bool wants(const StreamInfo& stream) const;
@@ -167,6 +193,8 @@ class Recorder {
     std::vector<std::pair<StreamId, MonoTime>> removed_;  // of these, and when
     std::size_t untried_ = 0;
     std::vector<Source> opened_;
+    std::vector<SetProperty> set_properties_;                   // the last change of each stream
+    std::vector<std::pair<StreamId, NewProperty>> properties_;  // fetched
     std::vector<std::string> notices_;
     std::optional<MonoTime> stop_at_;
 
@@ -193,6 +221,11 @@ class Recorder {
   // What cannot be read any more is opened again.
   void check_readers();
   static void follow_restart(Source& source);
+  static void forget_properties(Source& source);
+  void add_property(const StreamId& id, NewProperty property);
+  // Those whose time is known.
+  //   all  the others, too
+  Result<void> write_properties(Source& source, bool all);
   Result<void> write(Source& source, const SampleInfo& info);
   // Takes what there is until now and completes the file.
   Result<void> complete();
@@ -206,7 +239,8 @@ class Recorder {
   Opener opener_;
   std::vector<Source> sources_;
   std::vector<std::byte> payload_;
-  double filled_ = 0;  // the greatest part of a ring that was new in this turn
+  Time newest_time_ = Time::min();  // of the samples in the file
+  double filled_ = 0;               // the greatest part of a ring that was new in this turn
   Duration period_ = kMinPeriod;
   bool is_more_ = false;  // to be taken at once
   MonoTime all_by_{};     // until then the past waits for streams to be opened

@@ -49,6 +49,12 @@ double rate_hz(const RecordedStreamInfo& stream) {
   return stream.samples > 1 && seconds > 0 ? static_cast<double>(stream.samples - 1) / seconds : 0;
 }
 
+// Besides the property that it had at its beginning.
+std::size_t property_changes(const RecordedStreamInfo& stream) {
+  const std::vector<Time>& times = stream.property_times;
+  return times.size() - (!times.empty() && times.front() == Time::min() ? 1 : 0);
+}
+
 Json json_of(const RecordedStreamInfo& stream) {
   const bool has_samples = stream.samples > 0;
   return {{"stream", stream.id.str()},
@@ -60,6 +66,7 @@ Json json_of(const RecordedStreamInfo& stream) {
           {"depth", stream.depth},
           {"cycle_ns", to_ns(stream.cycle)},
           {"property_bytes", stream.property.size()},
+          {"property_changes", property_changes(stream)},
           {"samples", stream.samples},
           {"samples_bytes", stream.payload_bytes},
           {"lost_samples", stream.lost_samples},

@@ -108,6 +108,11 @@ std::optional<Attachment> decode_attachment(std::span<const std::byte> content) 
 
 }  // namespace
 
+void add_property(std::vector<PropertyPlace>& properties, const PropertyPlace& added) {
+  while (!properties.empty() && properties.back().from >= added.from) properties.pop_back();
+  properties.push_back(added);
+}
+
 void FileReader::warn(std::string_view what) {
   if (warnings_.size() < kMaxWarnings) {
     warnings_.push_back(fmt::format("'{}': {}", path_.string(), printable(what)));
@@ -448,10 +453,24 @@ void FileReader::add_attachment(const AttachmentIndex& about, std::span<const st
   summary_.attachments.back().offset = about.offset;
   summary_.attachments.back().length = about.length;
   if (!attachment->about.name.starts_with(kPropertyName)) return;
+  const std::uint64_t log_time = attachment->about.log_time;
+  const Time from = log_time == 0           ? Time::min()
+                    : log_time >= INT64_MAX ? Time::max()
+                                            : time_from_ns(static_cast<std::int64_t>(log_time));
+  const auto offset = static_cast<std::uint64_t>(attachment->data.data() - content.data());
   for (auto& [id, channel] : channels_) {
     if (!channel.stream || property_name(channel.channel) != attachment->about.name) continue;
-    channel.stream->property.assign(attachment->data.begin(), attachment->data.end());
+    std::vector<std::byte>& last = channel.stream->property;
+    if (std::ranges::equal(last, attachment->data)) continue;
+    last.assign(attachment->data.begin(), attachment->data.end());
+    add_property(channel.properties,
+                 {from, about.offset + kRecordHeadBytes + offset, last.size(), 0});
   }
+}
+
+Result<std::vector<std::byte>> FileReader::property(const PropertyPlace& place) {
+  const auto bytes = DSSM_TRY(read(place.offset, place.bytes));
+  return std::vector<std::byte>(bytes.begin(), bytes.end());
 }
 
 void FileReader::add_metadata(const MetadataIndex& about, std::span<const std::byte> content) {

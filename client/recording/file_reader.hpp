@@ -63,15 +63,25 @@ struct LoadedChunk {
   }
 };
 
+// A property of a stream, in a file.
+struct PropertyPlace {
+  Time from{};                          // Time::min(): from the beginning on
+  std::uint64_t offset = 0, bytes = 0;  // of the bytes themselves
+  std::uint32_t file = 0;               // in a recording of several
+};
+// Appends one. Those before it that no time has are removed.
+void add_property(std::vector<PropertyPlace>& properties, const PropertyPlace& added);
+
 // A channel in a file.
 struct FileChannel {
   Channel channel;
-  std::optional<RecordedStream> stream;  // nullopt: of another program
-  bool is_left_out = false;              // no stream can be made of it
-  std::uint64_t lost_samples = 0;        // of gaps
-  std::uint64_t max_bytes = 0;           // of a message, of another program's channel
-  std::uint64_t messages = 0;            // of another program's channel: they are counted
-  Tid last_tid = kNoTid;                 // of our channel
+  std::optional<RecordedStream> stream;  // with its last property; nullopt: of another program
+  std::vector<PropertyPlace> properties;
+  bool is_left_out = false;        // no stream can be made of it
+  std::uint64_t lost_samples = 0;  // of gaps
+  std::uint64_t max_bytes = 0;     // of a message, of another program's channel
+  std::uint64_t messages = 0;      // of another program's channel: they are counted
+  Tid last_tid = kNoTid;           // of our channel
 };
 
 class FileReader {
@@ -94,6 +104,10 @@ class FileReader {
   // Reads a chunk of chunks().
   //   fails  protocol (damaged, or not what was announced), system, no_memory
   Result<std::shared_ptr<const LoadedChunk>> load(const IndexedChunk& chunk);
+
+  // The bytes of a property in this file.
+  //   fails  protocol (the file became shorter), system
+  Result<std::vector<std::byte>> property(const PropertyPlace& place);
 
   // Writes the end that the file does not have, in place.
   Result<RecordingRepair> repair();

@@ -96,7 +96,7 @@ void Chunk::clear() noexcept {
   messages.clear();
   used_parts = 0;
   start_time = UINT64_MAX;
-  end_time = payload_bytes = 0;
+  end_time = payload_bytes = property_bytes = 0;
 }
 
 void encode_index(Buffer& out, const std::vector<IndexedChunk>& chunks) {
@@ -259,15 +259,15 @@ Result<void> FileWriter::add_channel(const NewChannel& channel) {
   return {};
 }
 
-Result<void> FileWriter::add_property(const Channel& channel, std::span<const std::byte> property) {
+Result<void> FileWriter::add_property(const Channel& channel, const NewProperty& property) {
   AttachmentIndex about;
   about.offset = bytes_;
-  about.log_time = summary_.chunks.empty() ? 0 : summary_.chunks.back().index.end_time;
-  about.data_bytes = property.size();
+  about.log_time = property.log_time;
+  about.data_bytes = property.property.size();
   about.name = property_name(channel);
   about.media_type = kPropertyMediaType;
   head_.clear();
-  encode_attachment(head_, about, property);
+  encode_attachment(head_, about, property.property);
   about.length = head_.size();
   DSSM_TRY(write({head_.span()}));
   summary_.attachments.push_back(std::move(about));

@@ -91,7 +91,7 @@ struct Gaps {
   std::vector<std::pair<Tid, std::uint64_t>> gaps;
 };
 
-// A channel with its schema and, from here on, its property.
+// A channel with its schema, and a property.
 struct NewChannel {
   Schema schema;
   Channel channel;
@@ -99,6 +99,7 @@ struct NewChannel {
 struct NewProperty {
   std::uint16_t channel = 0;
   std::vector<std::byte> property;
+  std::uint64_t log_time = 0;  // of the first sample with it; 0: from the beginning on
 };
 
 // What one chunk of the file is made from. `messages` are whole message records.
@@ -106,6 +107,7 @@ struct Chunk {
   // Come before the messages.
   std::vector<NewChannel> channels;
   std::vector<NewProperty> properties;
+  std::uint64_t property_bytes = 0;
   std::vector<Gaps> gaps;
   std::vector<RecordedTrigger> triggers;
 
@@ -124,6 +126,8 @@ struct Chunk {
     return messages.size() == 0 && channels.empty() && properties.empty() && gaps.empty() &&
            triggers.empty();
   }
+  // What it takes in memory, about.
+  std::uint64_t bytes() const noexcept { return messages.size() + property_bytes; }
   // Keeps the memory.
   void clear() noexcept;
 };
@@ -140,7 +144,7 @@ class FileWriter {
   // Of a channel that the file does not have, and of one that it has.
   //   fails  as append()
   Result<void> add_channel(const NewChannel& channel);
-  Result<void> add_property(const Channel& channel, std::span<const std::byte> property);
+  Result<void> add_property(const Channel& channel, const NewProperty& property);
 
   // Appends the messages, gaps and triggers of `chunk`, whose channels were added.
   //   fails  no_memory (a full disk), system, no_permission. The file is as before then

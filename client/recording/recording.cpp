@@ -43,6 +43,7 @@ struct IndexPart {
 // One incarnation of a stream; its number is that in Recording::streams().
 struct Life {
   std::vector<IndexPart> parts;
+  std::vector<PropertyPlace> properties;
   std::size_t group = 0;
 };
 
@@ -83,6 +84,9 @@ struct Content {
   std::uint64_t cached_bytes = 0;
 
   Result<void> add(std::uint32_t file);
+  void add_properties(std::size_t stream, std::uint32_t file, const FileChannel& channel);
+  // The index of a property is that in RecordedStreamInfo::property_times. With the mutex held.
+  Result<std::vector<std::byte>> property(std::size_t stream, std::size_t index);
   void finish();
 
   // --- with the mutex held
@@ -144,9 +148,9 @@ Result<void> Content::add(std::uint32_t number) {
                                  "files before; open it separately",
                                  file.path().string(), about.id.str())};
       }
-      known->property = about.property;
       known->type.payload_bytes = std::max(known->type.payload_bytes, about.type.payload_bytes);
     }
+    add_properties(at, number, channel);
     streams[at].lost_samples += channel.lost_samples;
   }
 
@@ -185,6 +189,28 @@ Result<void> Content::add(std::uint32_t number) {
     }
   }
   return {};
+}
+
+// A file begins with the property that the stream had in the file before.
+void Content::add_properties(std::size_t stream, std::uint32_t file, const FileChannel& channel) {
+  if (channel.properties.empty()) return;
+  RecordedStreamInfo& about = streams[stream];
+  std::vector<PropertyPlace>& all = lives[stream].properties;
+  const auto first = files[file]->property(channel.properties.front());
+  const bool is_repeated = !all.empty() && first && *first == about.property;
+  for (std::size_t i = is_repeated ? 1 : 0; i < channel.properties.size(); ++i) {
+    PropertyPlace place = channel.properties[i];
+    place.file = file;
+    add_property(all, place);
+  }
+  about.property = channel.stream->property;
+  about.property_times.clear();
+  for (const PropertyPlace& place : all) about.property_times.push_back(place.from);
+}
+
+Result<std::vector<std::byte>> Content::property(std::size_t stream, std::size_t index) {
+  const PropertyPlace& place = lives[stream].properties[index];
+  return files[place.file]->property(place);
 }
 
 void Content::finish() {
@@ -616,6 +642,24 @@ const std::vector<RecordedTrigger>& Recording::triggers() const noexcept {
   return content_->triggers;
 }
 
+std::optional<std::size_t> RecordedStreamInfo::property_at(Time t) const noexcept {
+  const auto after = std::ranges::upper_bound(property_times, t);
+  if (after == property_times.begin()) return std::nullopt;
+  return static_cast<std::size_t>(after - property_times.begin()) - 1;
+}
+
+Result<std::vector<std::byte>> Recording::property(std::size_t stream, std::size_t index) const {
+  const std::vector<RecordedStreamInfo>& all = streams();
+  if (stream >= all.size() || index >= all[stream].property_times.size()) {
+    return Error{Errc::invalid_argument,
+                 fmt::format("recording '{}' has no property {} of stream {}; streams() has the "
+                             "numbers",
+                             content_->paths.front().string(), index, stream)};
+  }
+  const std::lock_guard lock(content_->mutex);
+  return content_->property(stream, index);
+}
+
 std::vector<std::string> Recording::warnings() const {
   const std::lock_guard lock(content_->mutex);
   return content_->warnings;
@@ -886,9 +930,18 @@ std::uint64_t RecordedRawReader::incarnation() const noexcept {
 }
 
 Result<std::vector<std::byte>> RecordedRawReader::property() const {
-  if (!state_->about().property.empty()) return state_->about().property;
+  const std::lock_guard lock(state_->content->mutex);
+  const recording::ReaderState& state = *state_;
+  const auto sample = state.found([&] {
+    return state.content->from_tid(state.streams(), state.life, std::max<Tid>(state.cursor, 0));
+  });
+  const Time time = sample ? sample->second.message->info().time : Time::max();
+  if (const auto index = state.about().property_at(time)) {
+    std::vector<std::byte> property = DSSM_TRY(state.content->property(state.number(), *index));
+    if (!property.empty()) return property;
+  }
   return Error{Errc::not_found,
-               fmt::format("stream '{}' has no property in this recording", id().str())};
+               fmt::format("stream '{}' has no property there in this recording", id().str())};
 }
 
 std::uint64_t RecordedRawReader::lost_samples() const noexcept { return state_->lost; }

@@ -55,6 +55,9 @@ Result<void> FileReader::begin_log(std::string_view begin) {
   channel.channel.topic = topic_of(channel.stream->id);
   const auto property = DSSM_TRY(read(head.line_bytes, head.property_bytes));
   channel.stream->property.assign(property.begin(), property.end());
+  if (!property.empty()) {
+    channel.properties.push_back({Time::min(), head.line_bytes, head.property_bytes, 0});
+  }
   is_whole_ = true;
   data_start_ = data_end_ = head.records_at();
   return {};

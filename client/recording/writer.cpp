@@ -132,9 +132,9 @@ Result<std::uint32_t> Writer::add_stream(const RecordedStream& stream) {
   begin_chunk();
   open_->channels.push_back(std::move(added));
   if (!stream.property.empty()) {
-    open_->properties.push_back({static_cast<std::uint16_t>(number + 1), stream.property});
+    open_->properties.push_back({static_cast<std::uint16_t>(number + 1), stream.property, 0});
   }
-  streams_.push_back({stream.id, stream.type, stream.incarnation});
+  streams_.push_back({.id = stream.id, .type = stream.type, .incarnation = stream.incarnation});
   numbers_.emplace(key, number);
   return number;
 }
@@ -161,7 +161,7 @@ void Writer::begin_chunk() {
 
 // Hands the open chunk to the disk's thread.
 void Writer::take_open_chunk() {
-  waiting_bytes_ += open_->messages.size();
+  waiting_bytes_ += open_->bytes();
   waiting_.push_back(std::move(open_));
   if (spare_.empty()) {
     open_ = std::make_unique<Chunk>();
@@ -174,7 +174,7 @@ void Writer::take_open_chunk() {
 
 // The same, and waits while more than queue_bytes wait.
 void Writer::close_chunk(std::unique_lock<std::mutex>& lock) {
-  const std::uint64_t most = std::max<std::uint64_t>(options_.queue_bytes, open_->messages.size());
+  const std::uint64_t most = std::max<std::uint64_t>(options_.queue_bytes, open_->bytes());
   take_open_chunk();
   disk_.notify_one();
   caller_.wait(lock, [&] { return waiting_bytes_ <= most || error_; });
@@ -228,6 +228,7 @@ Result<void> Writer::write(std::uint32_t number, const SampleInfo& info, Duratio
   chunk.end_time = std::max(chunk.end_time, log_time);
   chunk.payload_bytes += payload.size();
   stream.last = info.tid;
+  stream.last_time = info.time;
   ++progress_.samples;
   progress_.payload_bytes += payload.size();
   progress_.waiting_bytes += payload.size();
@@ -253,17 +254,20 @@ Result<void> Writer::add_gap(std::uint32_t number, Tid first, std::uint64_t coun
   return {};
 }
 
-Result<void> Writer::set_property(std::uint32_t number, std::span<const std::byte> property) {
+Result<void> Writer::set_property(std::uint32_t number, std::span<const std::byte> property,
+                                  std::optional<Time> from) {
   std::unique_lock lock(mutex_);
   DSSM_TRY(check(number));
-  // Attachments lie between chunks: what was written before the property ends its chunk.
-  if (open_->messages.size() > 0) {
-    close_chunk(lock);
-    if (error_) return *error_;
+  const Stream& stream = streams_[number];
+  if (!from && stream.last != kNoTid) {
+    from = stream.last_time == Time::max() ? Time::max() : stream.last_time + Duration(1);
   }
   begin_chunk();
-  open_->properties.push_back(
-      {static_cast<std::uint16_t>(number + 1), {property.begin(), property.end()}});
+  open_->properties.push_back({static_cast<std::uint16_t>(number + 1),
+                               {property.begin(), property.end()},
+                               from ? log_time_of(*from) : 0});
+  open_->property_bytes += property.size();
+  if (open_->bytes() >= options_.chunk_bytes) close_chunk(lock);
   return {};
 }
 
@@ -330,7 +334,7 @@ void Writer::run_disk() {
       break;
     }
     lock.lock();
-    waiting_bytes_ -= chunk->messages.size();
+    waiting_bytes_ -= chunk->bytes();
     progress_.waiting_bytes -= chunk->payload_bytes;
     progress_.file_bytes = written_bytes_ + current_.bytes();
     progress_.files = files_;
@@ -360,7 +364,7 @@ Result<void> Writer::store(const Chunk& chunk) {
     for (DiskStream& earlier : disk_streams_) {
       if (earlier.channel.channel.topic == channel.channel.topic) earlier.replaced = true;
     }
-    disk_streams_.push_back({channel, {}});
+    disk_streams_.push_back({channel, {}, false});
     DSSM_TRY(current_.add_channel(channel));
   }
   // Of a stream that had restarted before the file began, and is written to all the same.
@@ -375,9 +379,9 @@ Result<void> Writer::store(const Chunk& chunk) {
   for (const NewProperty& property : chunk.properties) {
     DSSM_TRY(add(property.channel));
     DiskStream& stream = disk_streams_[property.channel - 1U];
-    if (stream.property == property.property) continue;
-    stream.property = property.property;
-    DSSM_TRY(current_.add_property(stream.channel.channel, stream.property));
+    if (stream.property.property == property.property) continue;
+    stream.property = property;
+    DSSM_TRY(current_.add_property(stream.channel.channel, property));
   }
   DSSM_TRY(current_.append(chunk, compressor_));
   delete_oldest();
@@ -421,7 +425,7 @@ Result<void> Writer::begin_file() {
 // In a file that does not have the stream yet.
 Result<void> Writer::repeat(const DiskStream& stream) {
   DSSM_TRY(current_.add_channel(stream.channel));
-  if (stream.property.empty()) return {};
+  if (stream.property.property.empty()) return {};
   return current_.add_property(stream.channel.channel, stream.property);
 }
 
@@ -515,8 +519,9 @@ Result<void> RecordingWriter::add_gap(std::uint32_t stream, Tid first, std::uint
 }
 
 Result<void> RecordingWriter::set_property(std::uint32_t stream,
-                                           std::span<const std::byte> property) {
-  return writer_->set_property(stream, property);
+                                           std::span<const std::byte> property,
+                                           std::optional<Time> from) {
+  return writer_->set_property(stream, property, from);
 }
 
 Result<void> RecordingWriter::add_trigger(const RecordedTrigger& trigger) {

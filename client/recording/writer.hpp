@@ -37,7 +37,8 @@ class Writer {
   Result<void> write(std::uint32_t stream, const SampleInfo& info, Duration clock_error,
                      std::span<const std::byte> payload);
   Result<void> add_gap(std::uint32_t stream, Tid first, std::uint64_t count);
-  Result<void> set_property(std::uint32_t stream, std::span<const std::byte> property);
+  Result<void> set_property(std::uint32_t stream, std::span<const std::byte> property,
+                            std::optional<Time> from);
   Result<void> add_trigger(const RecordedTrigger& trigger);
   RecordingProgress progress() const;
   Result<void> finish();
@@ -48,13 +49,14 @@ class Writer {
     TypeInfo type;
     std::uint64_t incarnation = 0;
     Tid last = kNoTid;
+    Time last_time{};         // of sample `last`
     std::uint64_t chunk = 0;  // number of the chunk in which `part` is its part
     std::size_t part = 0;
   };
   // What the disk's thread knows of a stream, to repeat it in the next file.
   struct DiskStream {
     NewChannel channel;
-    std::vector<std::byte> property;
+    NewProperty property;
     bool replaced = false;  // by a later incarnation
   };
 

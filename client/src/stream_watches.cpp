@@ -21,7 +21,7 @@ Result<std::uint64_t> StreamWatches::add(OnEvent on_event) {
     const std::lock_guard guard(mutex_);
     key = next_key_++;
     for (const auto& [name, stream] : known_) {
-      on_event(StreamEvent{StreamEvent::Kind::added, stream});
+      on_event(StreamEvent{StreamEvent::Kind::added, stream, false});
     }
     watches_[key] = std::move(on_event);
     is_first = !std::exchange(watching_, true);
@@ -67,8 +67,8 @@ void StreamWatches::on_message(const local::Response& message) {
 }
 
 void StreamWatches::on_event(const proto::StreamEvent& message) {
-  const StreamEvent event{message.removed() ? StreamEvent::Kind::removed : StreamEvent::Kind::added,
-                          wire::stream_info(message.stream())};
+  StreamEvent event{message.removed() ? StreamEvent::Kind::removed : StreamEvent::Kind::added,
+                    wire::stream_info(message.stream()), false};
   const std::string name = event.stream.id.str();
   const std::lock_guard guard(mutex_);
   unconfirmed_.erase(name);
@@ -76,9 +76,12 @@ void StreamWatches::on_event(const proto::StreamEvent& message) {
     if (known_.erase(name) == 0) return;
   } else {
     const auto [entry, is_new] = known_.try_emplace(name, event.stream);
-    const std::uint64_t known_incarnation = std::exchange(entry->second, event.stream).incarnation;
-    // Or it has a description now.
-    if (!is_new && known_incarnation == event.stream.incarnation) return;
+    const StreamInfo known = std::exchange(entry->second, event.stream);
+    if (!is_new && known.incarnation == event.stream.incarnation) {
+      event.property_set =
+          message.property_set() || known.property_bytes != event.stream.property_bytes;
+      if (!event.property_set) return;  // it has a description now
+    }
   }
   for (const auto& [key, callback] : watches_) callback(event);
 }

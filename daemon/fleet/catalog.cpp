@@ -57,11 +57,12 @@ void Catalog::host_down(const wire::HostId& id, const Error& error) {
   notify([&](CatalogObserver& observer) { observer.on_host_down(host, error); });
 }
 
-Result<void> Catalog::stream_added(const wire::HostId& id, StreamInfo stream) {
+Result<void> Catalog::stream_added(const wire::HostId& id, StreamInfo stream, bool property_set) {
   const auto found = hosts_.find(id);
   if (found == hosts_.end()) {
     return Error{Errc::not_found, "the host of stream '" + stream.id.str() + "' is not known"};
   }
+  const Tid newest = stream.newest;
   // What changes with each sample is as it was when the stream was created.
   stream.oldest = stream.newest = kNoTid;
   stream.rate_hz = 0;
@@ -83,8 +84,14 @@ Result<void> Catalog::stream_added(const wire::HostId& id, StreamInfo stream) {
                         old->second.type == stream.type;
   StreamInfo& entry = host.streams[Key{stream.id.name, stream.id.id}];
   entry = std::move(stream);
-  if (is_known) return {};
-  notify([&](CatalogObserver& observer) { observer.on_remote_stream_added(host, entry); });
+  if (!is_known) {
+    notify([&](CatalogObserver& observer) { observer.on_remote_stream_added(host, entry); });
+  }
+  if (property_set) {
+    StreamInfo then = entry;
+    then.newest = newest;
+    notify([&](CatalogObserver& observer) { observer.on_remote_property_set(then); });
+  }
   return {};
 }
 

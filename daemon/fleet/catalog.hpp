@@ -45,6 +45,8 @@ class CatalogObserver {
   virtual void on_host_clock(const KnownHost&) {}               // it reported its clock
   // Also: it has a new ring, or its ring is described now.
   virtual void on_remote_stream_added(const KnownHost&, const StreamInfo&) {}
+  // Another property, or none, from the sample after `stream.newest` on.
+  virtual void on_remote_property_set(const StreamInfo& /*stream*/) {}
   virtual void on_remote_stream_removed(const KnownHost&, const StreamInfo&) {}
 
  protected:
@@ -73,8 +75,9 @@ class Catalog {
   // A stream is there, has a new ring, or is described. Its id names the owner's host. Descriptions
   // of fields are left out when a host has too many of them; what changes with each sample is not
   // kept.
-  //   fails  limit_exceeded (this host has too many streams), not_found (no such host)
-  Result<void> stream_added(const wire::HostId& id, StreamInfo stream);
+  //   property_set  that is why the stream is reported again
+  //   fails         limit_exceeded (this host has too many streams), not_found (no such host)
+  Result<void> stream_added(const wire::HostId& id, StreamInfo stream, bool property_set = false);
   void stream_removed(const wire::HostId& id, const StreamId& stream);
   // The host's newest report of its clock.
   void set_clock(const wire::HostId& id, std::shared_ptr<const wire::ClockReport> clock);

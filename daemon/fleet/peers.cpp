@@ -400,7 +400,7 @@ Result<void> Peers::on_stream_event_untrusted(PeerConnection& connection,
   StreamInfo stream = wire::stream_info(event.stream());
   stream.id = std::move(id);
   stream.users.clear();
-  return catalog_.stream_added(them.host_id, std::move(stream));
+  return catalog_.stream_added(them.host_id, std::move(stream), event.property_set());
 }
 
 void Peers::on_watched(PeerConnection& connection) { set_tried(peer_of(connection)); }

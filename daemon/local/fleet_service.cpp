@@ -532,6 +532,10 @@ void FleetService::on_remote_stream_added(const KnownHost&, const StreamInfo& st
   if (observer_) observer_->on_remote_stream_added(stream);
 }
 
+void FleetService::on_remote_property_set(const StreamInfo& stream) {
+  if (observer_) observer_->on_remote_property_set(stream);
+}
+
 void FleetService::on_remote_stream_removed(const KnownHost&, const StreamInfo& stream) {
   if (observer_) observer_->on_remote_stream_removed(stream.id);
 }

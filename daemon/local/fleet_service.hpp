@@ -102,6 +102,7 @@ class FleetService final : public Fleet, private CatalogObserver {
   void on_list_timeout();
 
   void on_remote_stream_added(const KnownHost& host, const StreamInfo& stream) override;
+  void on_remote_property_set(const StreamInfo& stream) override;
   void on_remote_stream_removed(const KnownHost& host, const StreamInfo& stream) override;
 
   void state_clock(local::Host& host) const;

@@ -49,6 +49,7 @@ class Fleet {
   class Observer {
    public:
     virtual void on_remote_stream_added(const StreamInfo& stream) = 0;
+    virtual void on_remote_property_set(const StreamInfo& stream) = 0;
     virtual void on_remote_stream_removed(const StreamId& id) = 0;
     // Readers of `stream` (a mirror's ring) shall reopen it: there is a new ring.
     virtual void on_ring_replaced(const Stream& stream) = 0;

@@ -332,6 +332,10 @@ void LocalService::on_stream_described(const Stream& stream) {
   broadcast(added_event(stream, opens_));
 }
 
+void LocalService::on_property_set(const Stream& stream) {
+  broadcast(added_event(stream, opens_, true));
+}
+
 void LocalService::on_stream_removed(const Stream& stream) {
   const StreamId& id = stream.id();
   broadcast(removed_event(id, stream.incarnation()));
@@ -345,6 +349,13 @@ void LocalService::on_remote_stream_added(const StreamInfo& stream) {
   wire::to_message(stream, *event.mutable_stream());
   broadcast(event);
   notify_successors(stream.id);
+}
+
+void LocalService::on_remote_property_set(const StreamInfo& stream) {
+  proto::StreamEvent event;
+  event.set_property_set(true);
+  wire::to_message(stream, *event.mutable_stream());
+  broadcast(event);
 }
 
 void LocalService::on_remote_stream_removed(const StreamId& id) {

@@ -128,9 +128,11 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
 
   void on_stream_added(const Stream& stream) override;
   void on_stream_described(const Stream& stream) override;
+  void on_property_set(const Stream& stream) override;
   void on_stream_removed(const Stream& stream) override;
   void on_recovered() override { serve_deferred(); }
   void on_remote_stream_added(const StreamInfo& stream) override;
+  void on_remote_property_set(const StreamInfo& stream) override;
   void on_remote_stream_removed(const StreamId& id) override;
   void on_ring_replaced(const Stream& stream) override;
   void notify_replaced(const OpenTable::Reading& reading);

@@ -229,6 +229,10 @@ void ChannelServer::on_stream_added(const Stream& stream) {
   for (const auto& [key, communicator] : communicators_) communicator->on_stream_added(stream);
 }
 
+void ChannelServer::on_property_set(const Stream& stream) {
+  for (const auto& [key, communicator] : communicators_) communicator->on_property_set(stream);
+}
+
 void ChannelServer::on_stream_removed(const Stream& stream) {
   streams_.forget(stream);
   for (const auto& [key, communicator] : communicators_) communicator->on_stream_removed(stream);

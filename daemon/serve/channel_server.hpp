@@ -105,6 +105,7 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
 
   void on_stream_added(const Stream& stream) override;
   void on_stream_described(const Stream& stream) override { on_stream_added(stream); }
+  void on_property_set(const Stream& stream) override;
   void on_stream_removed(const Stream& stream) override;
   void on_recovered() override;
   void on_ended(DataCommunicator& communicator) override;

@@ -426,6 +426,10 @@ void DataCommunicator::on_stream_added(const Stream& stream) {
   if (waiting_) work_soon();  // perhaps for this one
 }
 
+void DataCommunicator::on_property_set(const Stream& stream) {
+  if (watch_) watch_->on_property_set(stream);
+}
+
 void DataCommunicator::on_stream_removed(const Stream& stream) {
   if (watch_) watch_->on_stream_removed(stream);
   if (channel_ && &channel_->stream() == &stream) channel_->on_removed();
@@ -490,19 +494,17 @@ void DataCommunicator::log_end(const Error& why) {
 
 StreamWatch::StreamWatch(const Registry& registry, const OpenTable& opens, FrameConnection& link,
                          Shows shows, std::uint64_t serial)
-    : registry_(registry),
-      opens_(opens),
-      link_(link),
-      shows_(std::move(shows)),
-      serial_(serial),
-      pending_(registry.streams().begin(), registry.streams().end()) {}
+    : registry_(registry), opens_(opens), link_(link), shows_(std::move(shows)), serial_(serial) {
+  for (const std::shared_ptr<Stream>& stream : registry.streams()) pending_.push_back({stream});
+}
 
 bool StreamWatch::work() {
   for (int sent = 0; !pending_.empty() && link_.output_empty(); ++sent) {
     if (sent == kStreamsPerTurn) return true;
-    const std::shared_ptr<const Stream> stream = pending_.front().lock();
+    const std::shared_ptr<const Stream> stream = pending_.front().stream.lock();
+    const bool property_set = pending_.front().property_set;
     pending_.pop_front();
-    if (stream && !stream->removed() && shows_(stream->id())) send_added(*stream);
+    if (stream && !stream->removed() && shows_(stream->id())) send_added(*stream, property_set);
   }
   if (!pending_.empty() || serial_ == 0 || registry_.may_miss_streams()) return false;
   net::Frame done;
@@ -513,9 +515,9 @@ bool StreamWatch::work() {
   return false;
 }
 
-void StreamWatch::send_added(const Stream& stream) {
+void StreamWatch::send_added(const Stream& stream, bool property_set) {
   net::Frame frame;
-  *frame.mutable_stream_event() = added_event(stream, opens_);
+  *frame.mutable_stream_event() = added_event(stream, opens_, property_set);
   link_.send(frame);
 }
 
@@ -524,8 +526,18 @@ void StreamWatch::on_stream_added(const Stream& stream) {
   if (pending_.empty()) {
     send_added(stream);
   } else {
-    pending_.push_back(stream.weak_from_this());
+    pending_.push_back({stream.weak_from_this()});
   }
+}
+
+// A program may set properties faster than the link takes events: then one is sent for several.
+void StreamWatch::on_property_set(const Stream& stream) {
+  if (!shows_(stream.id())) return;
+  if (pending_.empty() && link_.output_empty()) return send_added(stream, true);
+  const bool is_pending = std::any_of(pending_.begin(), pending_.end(), [&](const Pending& one) {
+    return one.property_set && one.stream.lock().get() == &stream;
+  });
+  if (!is_pending) pending_.push_back({stream.weak_from_this(), true});
 }
 
 // Also for one whose addition was not sent yet: a receiver ignores the removal of an unknown
@@ -539,7 +551,7 @@ void StreamWatch::on_new_rights(const Shows& showed) {
     const bool is_shown = shows_(stream->id());
     if (is_shown == showed(stream->id())) continue;
     if (is_shown) {
-      pending_.push_back(stream);
+      pending_.push_back({stream});
     } else {
       send_removed(*stream);
     }

@@ -54,13 +54,19 @@ class StreamWatch {
   bool work();
 
   void on_stream_added(const Stream& stream);
+  void on_property_set(const Stream& stream);
   void on_stream_removed(const Stream& stream);
   // The peer may see other streams than before.
   //   showed  what it could see
   void on_new_rights(const Shows& showed);
 
  private:
-  void send_added(const Stream& stream);
+  // An event that waits for the link.
+  struct Pending {
+    std::weak_ptr<const Stream> stream;
+    bool property_set = false;
+  };
+  void send_added(const Stream& stream, bool property_set = false);
   void send_removed(const Stream& stream);
 
   const Registry& registry_;
@@ -68,7 +74,7 @@ class StreamWatch {
   FrameConnection& link_;
   Shows shows_;
   std::uint64_t serial_;  // of Watch; 0: answered
-  std::deque<std::weak_ptr<const Stream>> pending_;
+  std::deque<Pending> pending_;
 };
 
 class DataCommunicator final : private FrameConnection::Observer, private StreamChannel::Observer {
@@ -123,6 +129,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   ~DataCommunicator();
 
   void on_stream_added(const Stream& stream);
+  void on_property_set(const Stream& stream);
   void on_stream_removed(const Stream& stream);
   void on_recovered();
 

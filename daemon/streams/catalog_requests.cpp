@@ -61,8 +61,9 @@ void describe(const Stream& stream, const OpenTable& opens, proto::Stream& out, 
   wire::to_message(info, out);
 }
 
-proto::StreamEvent added_event(const Stream& stream, const OpenTable& opens) {
+proto::StreamEvent added_event(const Stream& stream, const OpenTable& opens, bool property_set) {
   proto::StreamEvent event;
+  event.set_property_set(property_set);
   describe(stream, opens, *event.mutable_stream());
   return event;
 }

@@ -28,7 +28,8 @@ void describe(const Stream& stream, const OpenTable& opens, proto::Stream& out,
               bool with_fields = true);
 
 // The events that Watch is answered with, to programs and hosts alike.
-proto::StreamEvent added_event(const Stream& stream, const OpenTable& opens);
+proto::StreamEvent added_event(const Stream& stream, const OpenTable& opens,
+                               bool property_set = false);
 proto::StreamEvent removed_event(const StreamId& id, std::uint64_t incarnation = 0);
 
 // Stateless.

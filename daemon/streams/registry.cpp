@@ -214,6 +214,7 @@ Result<void> Registry::set_property(const StreamId& id, const std::string& prope
                              context, property.size(), limits_.max_property_bytes)};
   }
   DSSM_TRY(stream->set_property(property, budgets_.of(account)), context);
+  for (StreamObserver* observer : observers_) observer->on_property_set(*stream);
   return {};
 }
 

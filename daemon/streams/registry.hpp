@@ -27,6 +27,8 @@ class StreamObserver {
   virtual void on_stream_removed(const Stream& stream) = 0;
   // It has a description now.
   virtual void on_stream_described(const Stream&) {}
+  // It has another property now, or none.
+  virtual void on_property_set(const Stream&) {}
   // No stream of the dssmd before this one comes back any more.
   virtual void on_recovered() {}
 

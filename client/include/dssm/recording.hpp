@@ -127,9 +127,13 @@ class RecordingWriter {
   //   fails  as write()
   Result<void> add_gap(std::uint32_t stream, Tid first, std::uint64_t count);
 
-  // From here on the stream has that property (empty: none).
+  // The stream gets that property (empty: none). The one of add_stream() is that of the beginning.
+  //   from   the time of its first sample that has it; samples from there on may have been written.
+  //          Empty: 1 ns after the last one that was written, or the beginning if there is none.
+  //          A time before 1970 counts as the beginning
   //   fails  as write()
-  Result<void> set_property(std::uint32_t stream, std::span<const std::byte> property);
+  Result<void> set_property(std::uint32_t stream, std::span<const std::byte> property,
+                            std::optional<Time> from = {});
 
   // Adds what made the recorder write. Samples need not have been added before.
   //   fails  as write()
@@ -155,6 +159,14 @@ struct RecordedStreamInfo : RecordedStream {  // with the last property that it 
   std::uint64_t lost_samples = 0;  // of add_gap()
   Tid first_tid = kNoTid, last_tid = kNoTid;
   Time first_time{}, last_time{};  // the least and the greatest; meaningless without samples
+  // Since when it had each of its properties, which Recording::property() returns by their index
+  // here; Time::min(): since the beginning. They rise: a property that another one replaced for all
+  // of its time is not among them. Empty: it never had one.
+  std::vector<Time> property_times;
+
+  // The index of the property that it had at `t`; empty: it had none yet.
+  //   cost  O(log of their number)
+  std::optional<std::size_t> property_at(Time t) const noexcept;
 };
 
 // A sample as RecordingCursor returns it.
@@ -167,7 +179,8 @@ struct RecordedSample {
 };
 
 // Goes through all samples of all streams, in the order in which they were recorded. Several
-// recordings that are opened together, as logs of SSM, are merged by time.
+// recordings that are opened together, as logs of SSM, are merged by time. The property that a
+// stream had with a sample is the one with RecordedStreamInfo::property_at(info.time).
 //
 //   threads   one at a time
 //   lifetime  usable without its Recording
@@ -228,6 +241,14 @@ class Recording {
   // What made the recorder write, in the order of times. Empty: it did not wait for anything.
   //   lifetime  as streams()
   const std::vector<RecordedTrigger>& triggers() const noexcept;
+
+  // A property that a stream had, from the file.
+  //   stream  index in streams()
+  //   index   in RecordedStreamInfo::property_times
+  //   returns its bytes; none: it had none from then on
+  //   fails   invalid_argument (there is no such property), protocol (the file is shorter than when
+  //           it was opened), system
+  Result<std::vector<std::byte>> property(std::size_t stream, std::size_t index) const;
 
   // What could not be read, a sentence each: damaged chunks, channels that are no streams, files
   // without an end. More come when samples are read.
@@ -321,8 +342,9 @@ class RecordedRawReader {
   std::uint64_t depth() const noexcept;  // of the ring
   Duration cycle() const noexcept;
   std::uint64_t incarnation() const noexcept;
-  // The last one that it had.
-  //   fails  not_found (none)
+  // The one that it had at the time of the sample at cursor(): before the first read, of its first
+  // one. If that was not recorded, of the next one, and after all of them the last property.
+  //   fails  not_found (none), and as Recording::property()
   Result<std::vector<std::byte>> property() const;
 
   // Samples that read_next() skipped because they are not in the recording.

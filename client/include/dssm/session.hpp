@@ -171,6 +171,10 @@ struct StreamEvent {
   enum class Kind : std::uint8_t { added, removed };
   Kind kind = Kind::added;
   StreamInfo stream;  // for removed: identity only
+  // Added: the stream was known before, and its property was set, or removed (then
+  // stream.property_bytes is 0). Samples after stream.newest are written with the new one. Changes
+  // that follow each other closely may be reported once.
+  bool property_set = false;
 };
 
 // How a stream is created.
@@ -321,9 +325,10 @@ class Session {
   Result<StreamRights> stream_rights(const StreamId& id);
 
   // Calls `on_event` for each existing stream, then for each one added or removed, until the watch
-  // is destroyed. A stream that is recreated is reported as added again. The calls come from the
-  // session's thread, and from watch() itself: `on_event` must return soon and must not call the
-  // session. After a reconnect only differences are reported.
+  // is destroyed. A stream that is recreated is reported as added again, and so is one whose
+  // property was set (StreamEvent::property_set). The calls come from the session's thread, and
+  // from watch() itself: `on_event` must return soon and must not call the session. After a
+  // reconnect only differences are reported; a property differs if its length does.
   class Watch {
    public:
     Watch(Watch&&) noexcept;
@@ -340,7 +345,7 @@ class Session {
 
   // --- properties
 
-  // A constant block of bytes attached to a stream, which need not be open. At most 1 MiB, or the
+  // A block of bytes attached to a stream, which need not be open. At most 1 MiB, or the
   // limit that dssmd is configured with; 0 bytes remove it.
   //   fails  not_found (no such stream; property() also: none set), limit_exceeded, conflict
   Result<void> set_property(const StreamId& id, std::span<const std::byte> property);

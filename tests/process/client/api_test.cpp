@@ -457,6 +457,37 @@ TEST_F(Api, NotifiesWatchersOfAddedAndRemovedStreams) {
   EXPECT_EQ(seen, (std::vector<std::string>{"+before", "+later", "-before"}));
 }
 
+TEST_F(Api, NotifiesWatchersOfPropertiesWithTheNewestSample) {
+  auto writer = make("s");
+  std::mutex mutex;
+  std::condition_variable changed;
+  std::vector<StreamEvent> seen;
+  auto watch = session.watch([&](const StreamEvent& event) {
+    const std::lock_guard guard(mutex);
+    seen.push_back(event);
+    changed.notify_all();
+  });
+  ASSERT_TRUE(watch);
+  const std::byte property[] = {std::byte{1}, std::byte{2}};
+  ASSERT_TRUE(writer.set_property(property));
+  for (int i = 0; i < 5; ++i) write(writer, i);
+  ASSERT_TRUE(writer.set_property(property));  // the same bytes
+  ASSERT_TRUE(writer.set_property({}));
+  std::unique_lock lock(mutex);
+  changed.wait(lock, [&] { return seen.size() >= 4; });
+  EXPECT_FALSE(seen[0].property_set);
+  const Tid newest[] = {kNoTid, kNoTid, 4, 4};
+  const std::uint64_t bytes[] = {0, 2, 2, 0};
+  for (std::size_t i = 0; i < 4; ++i) {
+    EXPECT_EQ(seen[i].kind, StreamEvent::Kind::added);
+    EXPECT_EQ(seen[i].property_set, i > 0);
+    EXPECT_EQ(seen[i].stream.id, writer.id());
+    EXPECT_EQ(seen[i].stream.incarnation, writer.incarnation());
+    EXPECT_EQ(seen[i].stream.newest, newest[i]) << i;
+    EXPECT_EQ(seen[i].stream.property_bytes, bytes[i]) << i;
+  }
+}
+
 TEST_F(Api, AwaitsAStreamThatComesLater) {
   EXPECT_EQ(session.await_reader<Odometry>("late", deadline_in(10ms)).error().code,
             Errc::not_found);

@@ -78,9 +78,16 @@ using BlackBoxInAFleet = BlackBoxOn<FleetTest>;
 TEST_F(BlackBox, KeepsWhatWasBeforeAndAfterARequest) {
   auto power = session_.create<Power>("power", depth_of(4096)).value();
   power.write({24, -1}, WallClock::now() - 100s);
-  write_power(power, 0, 99);
+  write_power(power, 0, 49);
+  ASSERT_TRUE(power.set_property(std::vector{std::byte{1}}));
   Running running(recorder({"--before", "50s", "--after", "300ms"}), environment());
   await_armed(power.id());
+  const auto write_now = [&](std::int64_t first, std::int64_t last) {
+    for (std::int64_t i = first; i <= last; ++i) power.write({24, i});
+  };
+  write_now(50, 59);
+  ASSERT_TRUE(power.set_property(std::vector{std::byte{2}}));
+  write_now(60, 99);
   const Time before = WallClock::now();
   EXPECT_TRUE(contains(output({"trigger", "hard stop/1", "--reason", "a person said so"}),
                        "hard stop/1: requested of pc1"));
@@ -89,12 +96,17 @@ TEST_F(BlackBox, KeepsWhatWasBeforeAndAfterARequest) {
       << begun;
   const std::string file = quoted_file(begun);
   EXPECT_TRUE(contains(file, "/incident_20") && file.ends_with("_hard_stop_1.mcap")) << file;
-  write_power(power, 100, 199);
+  write_now(100, 199);
   const std::string ended = running.line();
   EXPECT_TRUE(ended.starts_with(file + ": 201 samples of 2 streams, ")) << ended;
   EXPECT_EQ(numbers_in(file), range(0, 199));
 
   const Recording recording = Recording::open(file).value();
+  auto reader = recording.open_reader<Power>("power").value();
+  while (const auto sample = reader.read_next()) {
+    EXPECT_EQ(reader.property().value(), std::vector{std::byte(sample->value.number < 60 ? 1 : 2)})
+        << sample->value.number;
+  }
   ASSERT_EQ(recording.triggers().size(), 1U);
   const RecordedTrigger& trigger = recording.triggers().front();
   EXPECT_EQ(trigger.name, "hard stop/1");

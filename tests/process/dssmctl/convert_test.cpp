@@ -142,6 +142,39 @@ TEST_F(Convert, RecompressesRecordings) {
   EXPECT_EQ(content_of(file("b.log")), content_of(a));
 }
 
+TEST_F(Convert, KeepsAllPropertiesWithTheirTimes) {
+  RecordingWriter writer = RecordingWriter::create(file("a.mcap")).value();
+  RecordedStream stream;
+  stream.id = {"pose", 0, "pc1"};
+  stream.type.payload_bytes = 8;
+  stream.incarnation = 1;
+  stream.property = {std::byte{1}};
+  const auto pose = writer.add_stream(stream).value();
+  stream.id.host = "pc2";
+  stream.property.clear();
+  const auto other = writer.add_stream(stream).value();
+  const double x = 1.5;
+  for (Tid tid = 0; tid < 10; ++tid) {
+    if (tid == 5) {
+      ASSERT_TRUE(writer.set_property(pose, {}));
+    }
+    for (const auto number : {pose, other}) {
+      ASSERT_TRUE(writer.write(number, {tid, at_ns(1000 + tid), 5ns, 8}, 5ns,
+                               std::as_bytes(std::span(&x, 1))));
+    }
+  }
+  ASSERT_TRUE(writer.set_property(other, std::vector{std::byte{2}}));
+  ASSERT_TRUE(writer.finish());
+  output({"convert", file("a.mcap"), file("b.mcap")});
+  const Recording recording = Recording::open(file("b.mcap")).value();
+  ASSERT_EQ(recording.streams().size(), 2U);
+  EXPECT_EQ(recording.streams()[0].property_times, (std::vector{Time::min(), at_ns(1005)}));
+  EXPECT_EQ(recording.property(0, 0).value(), std::vector{std::byte{1}});
+  EXPECT_EQ(recording.property(0, 1).value(), std::vector<std::byte>());
+  EXPECT_EQ(recording.streams()[1].property_times, std::vector{at_ns(1010)});
+  EXPECT_EQ(recording.property(1, 0).value(), std::vector{std::byte{2}});
+}
+
 TEST_F(Convert, InfoAndPlayTakeLogs) {
   const auto record = [](double time, double x) {
     std::string bytes(16, '\0');

@@ -42,6 +42,34 @@ void expect_poses(RecordedReader<RecordedPose>& reader, std::int64_t first, std:
   }
 }
 
+std::vector<std::byte> bytes_of(std::string_view text) {
+  const auto bytes = std::as_bytes(std::span(text));
+  return {bytes.begin(), bytes.end()};
+}
+
+// The properties that a stream of a recording had, each after the number of samples before it: "10
+// calibrated". None that is not there yet.
+std::vector<std::string> properties_in(const std::string& file, const std::string& stream) {
+  const Result<Recording> recording = Recording::open(file);
+  if (!recording) return {};
+  std::vector<std::string> all;
+  for (std::size_t i = 0; i < recording->streams().size(); ++i) {
+    const RecordedStreamInfo& about = recording->streams()[i];
+    if (about.id.name != stream) continue;
+    for (std::size_t n = 0; n < about.property_times.size(); ++n) {
+      int before = 0;
+      RecordingCursor cursor = recording->cursor();
+      for (RecordedSample sample; cursor.next(sample);) {
+        before += sample.stream == i && sample.info.time < about.property_times[n];
+      }
+      const auto property = recording->property(i, n).value();
+      all.push_back(std::to_string(before) + " " +
+                    std::string(reinterpret_cast<const char*>(property.data()), property.size()));
+    }
+  }
+  return all;
+}
+
 class Record : public CtlTest {
  protected:
   // Until dssmctl has the stream open: what is written from now on is recorded.
@@ -91,6 +119,53 @@ TEST_F(Record, KeepsWhatIsWrittenWithTimesTidsAndProperties) {
   RecordedReader<RecordedPose> reader = recorded(file_, "pose");
   expect_poses(reader, 10, 2009);
   EXPECT_FALSE(reader.read_next());
+}
+
+TEST_F(Record, HasEachPropertyFromTheRightSampleOn) {
+  auto pose = session_.create<RecordedPose>("pose", depth_of(4096)).value();
+  auto silent = session_.create<RecordedPose>("silent", depth_of(4)).value();
+  ASSERT_TRUE(pose.set_property(bytes_of("first")));
+  ASSERT_TRUE(silent.set_property(bytes_of("first")));
+  Running running(argv({"record", "-o", file_}), environment());
+  await_reader(pose.id());
+  await_reader(silent.id());
+  // The recorder may read the samples before it hears of the property.
+  write_poses(pose, 0, 9);
+  ASSERT_TRUE(pose.set_property(bytes_of("second")));
+  write_poses(pose, 10, 29);
+  ASSERT_TRUE(silent.set_property(bytes_of("second")));
+  await([&] { return properties_in(file_, "pose").size() == 2; });
+  ASSERT_TRUE(pose.set_property({}));
+  write_poses(pose, 30, 39);
+  await([&] { return properties_in(file_, "pose").size() == 3; });
+  ASSERT_TRUE(pose.set_property(bytes_of("no sample comes any more")));
+  await([&] { return properties_in(file_, "pose").size() == 4; });
+  ASSERT_TRUE(pose.set_property(bytes_of("just now")));
+  running.signal(SIGINT);
+  EXPECT_EQ(running.status(), 0);
+  // The last two are both after the last sample, at the same time of the recording.
+  EXPECT_EQ(properties_in(file_, "pose"),
+            (std::vector<std::string>{"0 first", "10 second", "30 ", "40 just now"}));
+  EXPECT_EQ(properties_in(file_, "silent"), std::vector<std::string>{"0 second"});
+  const Json info = Json::parse(output({"info", file_, "--json"}));
+  EXPECT_EQ(info["streams"][0]["property_changes"], 3) << info.dump(2);
+  EXPECT_EQ(info["streams"][1]["property_changes"], 0) << info.dump(2);
+}
+
+TEST_F(Record, HasThePropertyOfAStreamThatRestarts) {
+  auto pose = std::optional(session_.create<RecordedPose>("pose", depth_of(64)).value());
+  ASSERT_TRUE(pose->set_property(bytes_of("first")));
+  Running running(argv({"record", "-o", file_}), environment());
+  await_reader(pose->id());
+  write_poses(*pose, 0, 9);
+  ASSERT_TRUE(session_.remove(pose->id()));
+  pose = session_.create<RecordedPose>("pose", depth_of(64)).value();
+  ASSERT_TRUE(pose->set_property(bytes_of("again")));
+  write_poses(*pose, 0, 4);
+  await([&] { return properties_in(file_, "pose").size() == 2; });
+  running.signal(SIGINT);
+  EXPECT_EQ(running.status(), 0);
+  EXPECT_EQ(properties_in(file_, "pose"), (std::vector<std::string>{"0 first", "0 again"}));
 }
 
 TEST_F(Record, OfThePastTakesWhatTheRingsHoldOfThatTimeAndEnds) {
@@ -293,18 +368,27 @@ TEST_F(Record, SaysWhatIsWrong) {
 
 class Play : public Record {
  protected:
-  // A recording of samples 0 to 99 of write_poses() in stream "pose", with a property.
+  // A recording of samples 0 to 99 of write_poses() in stream "pose", with one property, and from
+  // sample 50 on another one.
   void make_recording() {
     auto writer = RecordingWriter::create(file_).value();
     RecordedStream stream{{"pose", 0, "pc9"}, type_of<RecordedPose>(), 512, 1ms, 1, {}};
     stream.property = {std::byte{7}};
     const std::uint32_t number = writer.add_stream(stream).value();
     for (std::int64_t i = 0; i < 100; ++i) {
+      if (i == 50) {
+        ASSERT_TRUE(writer.set_property(number, std::vector{std::byte{8}}));
+      }
       const RecordedPose pose{0.5 * static_cast<double>(i), -1, i};
       const SampleInfo info{i, at_ns(kSecond + i * 1'000'000), Duration(i), sizeof pose};
       ASSERT_TRUE(writer.write(number, info, 1us, std::as_bytes(std::span(&pose, 1))));
     }
     ASSERT_TRUE(writer.finish());
+  }
+
+  int property() {  // -1: none
+    const auto property = session_.property({"pose", 0, ""});
+    return property ? std::to_integer<int>(property->at(0)) : -1;
   }
 
   void expect_played(const std::string& stream, std::int64_t first, std::int64_t last) {
@@ -329,7 +413,52 @@ TEST_F(Play, GivesBackWhatWasRecorded) {
   EXPECT_EQ(info.type, type_of<RecordedPose>());
   EXPECT_EQ(info.depth, 512U);
   EXPECT_EQ(info.cycle, 1ms);
-  EXPECT_EQ(session_.property(info.id).value(), std::vector<std::byte>{std::byte{7}});
+  EXPECT_EQ(property(), 8) << "the one at the end";
+}
+
+TEST_F(Play, SetsThePropertyOfTheTimeAtWhichItIs) {
+  make_recording();
+  output({"play", file_, "--to", "1.049"});
+  EXPECT_EQ(property(), 7);
+  output({"play", file_, "--rate", "-1"});
+  EXPECT_EQ(property(), 7);
+  output({"play", file_, "--from", "1.050", "--rate", "1e6"});
+  EXPECT_EQ(property(), 8);
+  Running looped(argv({"play", file_, "--loop", "--rate", "0.1"}), environment());
+  for (const int expected : {7, 8, 7, 8}) {
+    await([&] { return property() == expected; });
+  }
+  looped.signal(SIGINT);
+  EXPECT_EQ(looped.status(), 0);
+}
+
+// Where it has no sample for a while, and when none comes any more.
+TEST_F(Play, SetsPropertiesOfAStreamWithoutSamples) {
+  auto writer = RecordingWriter::create(file_).value();
+  RecordedStream stream{{"pose", 0, "pc9"}, type_of<RecordedPose>(), 512, 1ms, 1, {}};
+  const auto number = writer.add_stream(stream).value();
+  const RecordedPose pose{1, 2, 3};
+  for (const std::int64_t tid : {0, 1}) {
+    const SampleInfo info{tid, at_ns((1 + 10'000 * tid) * kSecond), Duration(0), sizeof pose};
+    ASSERT_TRUE(writer.write(number, info, 1us, std::as_bytes(std::span(&pose, 1))));
+  }
+  for (const int property : {1, 2}) {
+    ASSERT_TRUE(writer.set_property(number, std::vector{static_cast<std::byte>(property)},
+                                    at_ns(1000 * property * kSecond)));
+  }
+  ASSERT_TRUE(writer.set_property(number, std::vector{std::byte{9}}));
+  ASSERT_TRUE(writer.finish());
+  auto clock = session_.open_playback_clock().value();
+  Running running(argv({"play", file_}), environment());
+  await([&] { return clock.now_s() < 10; });
+  EXPECT_EQ(property(), -1);
+  for (const int expected : {1, 2}) {
+    clock.set_time(1000 * expected - 0.5);
+    await([&] { return property() == expected; });
+  }
+  clock.set_speed(1e6);
+  EXPECT_EQ(running.status(), 0);
+  EXPECT_EQ(property(), 9);
 }
 
 TEST_F(Play, PlaysAPartUnderAnotherName) {
@@ -485,10 +614,19 @@ TEST_F(PlayByKeys, StepsInBothDirections) {
 
 TEST_F(PlayByKeys, JumpsAndGivesWhatTheStreamsHadThen) {
   play({"--start-paused"});
+  EXPECT_EQ(property(), 7);
   clock_.set_time(1.0505);  // as another program may do
   expect_next(50);
+  EXPECT_EQ(property(), 8);
+  press(kRight), expect_next(51);
+  press(kLeft), expect_next(50);
+  press(kLeft), expect_next(49);
+  EXPECT_EQ(property(), 7);
+  press(kRight), expect_next(50);
+  EXPECT_EQ(property(), 8);
   press(kRight), expect_next(51);
   press(kHome), expect_next(0);
+  EXPECT_EQ(property(), 7);
   press(kRight), expect_next(1);
   press(kPageDown), expect_next(99);  // to the end, where it stays while it is paused
   press(" ");
@@ -512,10 +650,151 @@ TEST_F(PlayByKeys, ChangesSpeedAndDirection) {
   EXPECT_EQ(wait_for(std::exchange(pid_, -1)), 0);
 }
 
+// play(record(x)) is x: `origin_` has the streams, and daemon_ gets them.
+class RoundTrip : public PlayByKeys {
+ protected:
+  static constexpr std::int64_t kSamples = 60;
+
+  // Which stream sample number `i` of all is of, and with which clock error.
+  static bool is_of_pose(std::int64_t i) { return i % 3 != 1; }
+  static Duration clock_error_of(std::int64_t i) {
+    return i % 5 == 0 ? kUnknownClockError : Duration(1000 + i * i);
+  }
+  static Time time_of(std::int64_t i) { return at_ns(kSecond + i * 10'000'001); }
+
+  // All that a recording has of its samples, by stream.
+  struct Sample {
+    SampleInfo info;
+    Duration bound;
+    std::vector<std::byte> payload;
+    friend bool operator==(const Sample& a, const Sample& b) {
+      return a.info.tid == b.info.tid && a.info.time == b.info.time &&
+             a.info.clock_error == b.info.clock_error && a.bound == b.bound &&
+             a.payload == b.payload;
+    }
+  };
+  static std::map<std::string, std::vector<Sample>> samples_in(const Recording& recording) {
+    std::map<std::string, std::vector<Sample>> all;
+    RecordingCursor cursor = recording.cursor();
+    for (RecordedSample sample; cursor.next(sample);) {
+      all[recording.streams()[sample.stream].id.str()].push_back(
+          {sample.info, sample.clock_error, {sample.payload.begin(), sample.payload.end()}});
+    }
+    return all;
+  }
+
+  DaemonProcess origin_;
+  Session there_ = session_with(origin_);
+};
+
+TEST_F(RoundTrip, OfRecordAndPlayKeepsAll) {
+  const std::string first = folder_.file("first.mcap"), second = folder_.file("second.mcap");
+  // Between them samples are written.
+  const std::vector<std::pair<std::string, std::string>> changes = {
+      {"p0", ""}, {"p1", "b1"}, {"", "b2"}, {"p3", ""}};
+  const auto properties_of = [](const std::string& file) {
+    return std::pair(properties_in(file, "pose"), properties_in(file, "blob"));
+  };
+  {
+    auto pose = there_.create<RecordedPose>("pose", depth_of(128)).value();
+    const TypeInfo opaque{"", 24, 1, {}};
+    auto blob = there_.create_raw({"blob", 2, ""}, opaque, {64, 7ms}).value();
+    ASSERT_TRUE(pose.set_property(bytes_of(changes[0].first)));
+    Running record(argv({"record", "-o", first}), {origin_.environment()});
+    for (const StreamId& id : {pose.id(), blob.id()}) {
+      await([&] { return there_.stream_info(id).value().readers >= 1; });
+    }
+    std::size_t set_pose = 1, set_blob = 0;
+    for (std::int64_t i = 0; i < kSamples; ++i) {
+      if (is_of_pose(i)) {
+        pose.write({static_cast<double>(i), -0.5, i}, time_of(i), clock_error_of(i));
+      } else {
+        std::vector<std::byte> payload(24, static_cast<std::byte>(i));
+        blob.write(payload, time_of(i), clock_error_of(i));
+      }
+      if (i % 20 != 19) continue;
+      // One that is replaced at once may be missed.
+      await([&] {
+        const auto [of_pose, of_blob] = properties_of(first);
+        return of_pose.size() == set_pose && of_blob.size() == set_blob;
+      });
+      const auto& [to_pose, to_blob] = changes[static_cast<std::size_t>(i / 20 + 1)];
+      ASSERT_TRUE(pose.set_property(bytes_of(to_pose)));
+      ASSERT_TRUE(blob.set_property(bytes_of(to_blob)));
+      ++set_pose, ++set_blob;
+    }
+    await([&] { return properties_of(first).second.size() == set_blob; });
+    record.signal(SIGINT);
+    EXPECT_EQ(record.status(), 0);
+  }
+  using Texts = std::vector<std::string>;
+  EXPECT_EQ(properties_of(first),
+            std::pair(Texts({"0 p0", "13 p1", "27 ", "40 p3"}), Texts({"7 b1", "13 b2", "20 "})));
+
+  Running record(argv({"record", "-o", second}), environment());
+  file_ = first;
+  play({"--start-paused"});
+  for (std::int64_t i = 0; i < kSamples; ++i) {
+    press(kRight);
+    // Each property came with the first sample after it.
+    if (i % 20 != 19) continue;
+    const auto changed = static_cast<std::size_t>(i / 20);
+    await([&] {
+      read_some();
+      const auto [of_pose, of_blob] = properties_of(second);
+      return of_pose.size() == changed + 1 && of_blob.size() == changed;
+    });
+  }
+  press(" ");  // to the end
+  EXPECT_EQ(wait_for(std::exchange(pid_, -1)), 0);
+  await([&] { return properties_of(second).second.size() == 3; });
+  record.signal(SIGINT);
+  EXPECT_EQ(record.status(), 0);
+
+  EXPECT_EQ(properties_of(second), properties_of(first));
+  const Recording one = Recording::open(first).value(), other = Recording::open(second).value();
+  const auto samples = samples_in(one);
+  ASSERT_EQ(samples.size(), 2U);
+  EXPECT_EQ(samples.at("pose:0@pc1").size(), 40U);
+  EXPECT_EQ(samples.at("blob:2@pc1").size(), 20U);
+  EXPECT_TRUE(samples_in(other) == samples);
+  ASSERT_EQ(other.streams().size(), 2U);
+  for (const RecordedStreamInfo& stream : one.streams()) {
+    const auto played = std::ranges::find(other.streams(), stream.id, &RecordedStreamInfo::id);
+    ASSERT_NE(played, other.streams().end()) << stream.id.str();
+    EXPECT_EQ(played->type, stream.type);
+    EXPECT_EQ(played->depth, stream.depth);
+    EXPECT_EQ(played->cycle, stream.cycle);
+    EXPECT_EQ(played->lost_samples, 0U);
+  }
+}
+
 class RecordFleet : public FleetTest {
  protected:
   TestFolder folder_;
 };
+
+TEST_F(RecordFleet, HasThePropertiesOfStreamsOfOtherHosts) {
+  const std::string file = folder_.file("a.mcap");
+  auto there = on_pc2_.create<RecordedPose>("pose", depth_of(4096)).value();
+  await_streams(1);
+  Running running(argv({"record", "-o", file}), environment());
+  std::int64_t next = 0;  // sample; of which the first ones are before the recording
+  await([&] {
+    write_poses(there, next, next);
+    ++next;
+    const Result<Recording> recording = Recording::open(file);
+    return recording && !recording->streams().empty() && recording->streams()[0].samples > 0;
+  });
+  ASSERT_TRUE(there.set_property(bytes_of("calibrated")));
+  write_poses(there, next, next + 9);
+  await([&] { return !properties_in(file, "pose").empty(); });
+  running.signal(SIGINT);
+  EXPECT_EQ(running.status(), 0);
+  const Recording recording = Recording::open(file).value();
+  EXPECT_EQ(recording.streams()[0].property_times, std::vector{at_ns(kSecond + next * 1'000'000)});
+  EXPECT_EQ(recording.property(0, 0).value(), bytes_of("calibrated"));
+}
 
 TEST_F(RecordFleet, PlaysHereWhatAnotherHostWritesNow) {
   const std::string file = folder_.file("a.mcap");

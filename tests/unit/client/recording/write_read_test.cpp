@@ -328,6 +328,134 @@ TEST_F(RecordingFiles, KeepTheLastPropertyAndItsAbsence) {
             Errc::not_found);
 }
 
+// The properties of a stream, each after the ns of its time, "begin" for that of the beginning.
+std::vector<std::string> properties_of(const Recording& recording, std::size_t stream) {
+  std::vector<std::string> all;
+  const std::vector<Time>& times = recording.streams()[stream].property_times;
+  for (std::size_t i = 0; i < times.size(); ++i) {
+    const Bytes property = recording.property(stream, i).value();
+    all.push_back((times[i] == Time::min() ? "begin" : std::to_string(to_ns(times[i]))) + " " +
+                  std::string(reinterpret_cast<const char*>(property.data()), property.size()));
+  }
+  return all;
+}
+
+Bytes bytes_of(std::string_view text) {
+  const auto bytes = std::as_bytes(std::span(text));
+  return {bytes.begin(), bytes.end()};
+}
+
+using Texts = std::vector<std::string>;
+
+TEST_F(RecordingFiles, HaveEachPropertyFromItsTimeOn) {
+  RecordedStream first = plain_stream("a", 24);
+  first.property = bytes_of("one");
+  RecordingWriter writer = RecordingWriter::create(path("a.mcap")).value();
+  const auto a = writer.add_stream(first).value();
+  const auto b = writer.add_stream(plain_stream("b", 24)).value();
+  for (Tid tid = 0; tid < 3; ++tid) write(writer, a, sample_at(tid, 10 * (tid + 1)));
+  ASSERT_TRUE(writer.set_property(a, bytes_of("two")));  // after the last sample
+  ASSERT_TRUE(writer.set_property(a, bytes_of("two")));
+  for (Tid tid = 3; tid < 6; ++tid) write(writer, a, sample_at(tid, 10 * (tid + 1)));
+  ASSERT_TRUE(writer.set_property(a, bytes_of("three"), time_from_ns(50)));  // noticed late
+  ASSERT_TRUE(writer.set_property(a, {}, time_from_ns(90)));
+  ASSERT_TRUE(writer.set_property(b, bytes_of("early")));  // there are no samples
+  write(writer, b, sample_at(0, -5));
+  ASSERT_TRUE(writer.set_property(b, bytes_of("before 1970")));
+  ASSERT_TRUE(writer.finish());
+
+  const auto expect_all = [&](const Recording& recording) {
+    EXPECT_EQ(properties_of(recording, a), (Texts{"begin one", "31 two", "50 three", "90 "}));
+    EXPECT_EQ(properties_of(recording, b), Texts{"begin before 1970"});
+    EXPECT_EQ(recording.streams()[a].property, Bytes());
+    const RecordedStreamInfo& about = recording.streams()[a];
+    EXPECT_EQ(about.property_at(Time::min()), 0U);
+    EXPECT_EQ(about.property_at(time_from_ns(30)), 0U);
+    EXPECT_EQ(about.property_at(time_from_ns(31)), 1U);
+    EXPECT_EQ(about.property_at(Time::max()), 3U);
+    EXPECT_EQ(recording.property(a, 4).error().code, Errc::invalid_argument);
+    EXPECT_EQ(recording.property(2, 0).error().code, Errc::invalid_argument);
+  };
+  const Recording recording = open_recording(path("a.mcap"));
+  expect_all(recording);
+
+  // A reader has that of its place.
+  RecordedRawReader reader = recording.open_raw_reader({"a", 0, ""}).value();
+  Bytes payload(24);
+  SampleInfo info;
+  EXPECT_EQ(reader.property().value(), bytes_of("one")) << "of the first sample";
+  for (const char* property : {"one", "one", "one", "two", "three", "three"}) {
+    ASSERT_EQ(reader.read_next(payload, info), ReadStatus::ok);
+    EXPECT_EQ(reader.property().value(), bytes_of(property)) << info.tid;
+  }
+  ASSERT_EQ(reader.read_previous(payload, info), ReadStatus::ok);
+  ASSERT_EQ(reader.read_previous(payload, info), ReadStatus::ok);
+  EXPECT_EQ(reader.property().value(), bytes_of("two"));
+  reader.seek(1000);
+  EXPECT_EQ(reader.property().error().code, Errc::not_found) << "it was removed";
+
+  // The same by all records, without the summary.
+  std::filesystem::resize_file(path("a.mcap"), std::filesystem::file_size(path("a.mcap")) - 1);
+  expect_all(open_recording(path("a.mcap")));
+}
+
+TEST_F(RecordingFiles, LeaveOutAPropertyThatAnotherOneReplacedForAllOfItsTime) {
+  RecordingWriter writer = RecordingWriter::create(path("a.mcap")).value();
+  const auto stream = writer.add_stream(plain_stream("s", 24)).value();
+  write(writer, stream, sample_at(0, 100));
+  ASSERT_TRUE(writer.set_property(stream, bytes_of("a"), time_from_ns(50)));
+  ASSERT_TRUE(writer.set_property(stream, bytes_of("b"), time_from_ns(80)));
+  ASSERT_TRUE(writer.set_property(stream, bytes_of("c"), time_from_ns(90)));
+  ASSERT_TRUE(writer.set_property(stream, bytes_of("d"), time_from_ns(80)));
+  ASSERT_TRUE(writer.finish());
+  EXPECT_EQ(properties_of(open_recording(path("a.mcap")), stream), (Texts{"50 a", "80 d"}));
+  EXPECT_FALSE(open_recording(path("a.mcap")).streams()[stream].property_at(time_from_ns(49)));
+}
+
+TEST_F(RecordingFiles, RepeatThePropertyOfTheFileBeforeWithItsTime) {
+  RecordingOptions options;
+  options.compression = Compression::none;
+  options.chunk_bytes = 500;
+  options.max_file_bytes = 3000;
+  RecordingWriter writer = RecordingWriter::create(path("a.mcap"), options).value();
+  const auto stream = writer.add_stream(plain_stream("s", 24)).value();
+  Texts expected;
+  for (int i = 0; i < 300; ++i) {
+    if (i % 100 == 30) {
+      const std::string text = "p" + std::to_string(i);
+      ASSERT_TRUE(writer.set_property(stream, bytes_of(text)));
+      expected.push_back(std::to_string(i * 10 - 9) + " " + text);
+    }
+    write(writer, stream, sample_at(i, i * 10));
+  }
+  ASSERT_TRUE(writer.finish());
+  ASSERT_GT(writer.progress().files, 6U);
+  EXPECT_EQ(properties_of(open_recording(folder_), stream), expected);
+  const std::string last = "a_" + std::to_string(writer.progress().files - 1) + ".mcap";
+  EXPECT_EQ(properties_of(open_recording(path(last)), stream), Texts{expected.back()});
+}
+
+// Before properties had times, each file began with one of time 0, and a change had the time of the
+// chunk before.
+TEST_F(RecordingFiles, OpenFromBeforePropertiesHadTimes) {
+  std::vector<std::filesystem::path> files;
+  for (const int number : {0, 1}) {
+    files.push_back(path(std::to_string(number) + ".mcap"));
+    RecordingWriter writer = RecordingWriter::create(files.back()).value();
+    RecordedStream about = plain_stream("s", 24);
+    about.property = bytes_of(number == 0 ? "one" : "two");
+    const auto stream = writer.add_stream(about).value();
+    for (Tid tid = 0; tid < 3; ++tid) {
+      write(writer, stream, sample_at(10 * number + tid, 100 * number + 10 * tid));
+    }
+    if (number == 0) {
+      ASSERT_TRUE(writer.set_property(stream, bytes_of("two"), time_from_ns(20)));
+    }
+    ASSERT_TRUE(writer.finish());
+  }
+  EXPECT_EQ(properties_of(Recording::open(files).value(), 0), (Texts{"begin one", "20 two"}));
+}
+
 TEST_F(RecordingFiles, HoldAnOldChunkWithoutFurtherSamples) {
   RecordingOptions options;
   options.chunk_age = std::chrono::milliseconds(1);

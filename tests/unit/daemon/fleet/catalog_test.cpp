@@ -44,6 +44,9 @@ class Recorder final : public CatalogObserver {
   void on_remote_stream_added(const KnownHost&, const StreamInfo& info) override {
     events.push_back("+" + info.id.str());
   }
+  void on_remote_property_set(const StreamInfo& info) override {
+    events.push_back(info.id.str() + " property after " + std::to_string(info.newest));
+  }
   void on_remote_stream_removed(const KnownHost&, const StreamInfo& info) override {
     events.push_back("-" + info.id.str());
   }
@@ -99,6 +102,19 @@ TEST(Catalog, ReportsANewRingAndNotTheSameOneAgain) {
   ASSERT_TRUE(catalog.stream_added(id_of(2), stream("lidar", "pc2", 2)));
   EXPECT_EQ(recorder.take(), Told{"+lidar:0@pc2"});
   EXPECT_EQ(catalog.find(id_of(2))->streams.size(), 1u);
+}
+
+TEST(Catalog, ReportsAPropertyWithTheNewestSampleThatItDoesNotKeep) {
+  Catalog catalog("pc1");
+  Recorder recorder;
+  catalog.host_up(host("pc2", 2), at("10.0.0.2"));
+  catalog.add_observer(recorder);
+  StreamInfo info = stream("lidar", "pc2");
+  info.newest = 7;
+  ASSERT_TRUE(catalog.stream_added(id_of(2), info));
+  ASSERT_TRUE(catalog.stream_added(id_of(2), info, true));
+  EXPECT_EQ(recorder.take(), (Told{"+lidar:0@pc2", "lidar:0@pc2 property after 7"}));
+  EXPECT_EQ(catalog.find(id_of(2))->streams.begin()->second.newest, kNoTid);
 }
 
 TEST(Catalog, KeepsTheFirstAddressOfAHostThatAnswersAtTwo) {

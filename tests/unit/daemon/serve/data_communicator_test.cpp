@@ -663,7 +663,10 @@ std::string events(const std::vector<net::Frame>& items) {
     if (item.has_done()) text += "done ";
     if (!item.has_stream_event()) continue;
     const proto::StreamEvent& event = item.stream_event();
-    text += (event.removed() ? "-" : "+") + event.stream().id().name() + " ";
+    text += (event.removed()        ? "-"
+             : event.property_set() ? "p"
+                                    : "+") +
+            event.stream().id().name() + " ";
   }
   return text;
 }
@@ -740,6 +743,31 @@ TEST(StreamWatch, WaitsForAPeerThatReadsSlowlyAndKeepsTheOrder) {
   EXPECT_GT(again, text.find("+s298 ")) << "in the order of creation";
   EXPECT_LT(again, text.find("done "));
   EXPECT_EQ(std::count(text.begin(), text.end(), '+'), 300);
+}
+
+TEST(StreamWatch, SendsOneEventForPropertiesThatAPeerReadsTooSlowlyFor) {
+  ServerRig rig;
+  for (const char* name : {"a", "b"}) rig.create(name);
+  MemoryPeer peer;
+  rig.connect(peer);
+  peer.put(watch_request(1));
+  rig.turns();
+  EXPECT_EQ(events(peer.take()), "+a +b done ");
+  const auto set = [&](const char* name, const std::string& property) {
+    ASSERT_TRUE(rig.registry.set_property({name, 0, ""}, property));
+  };
+  set("a", "1");
+  rig.turns();
+  EXPECT_EQ(events(peer.take()), "pa ");
+  peer.room = 0;
+  for (int i = 0; i < 1000; ++i) {
+    set("a", std::to_string(i));
+    set("b", std::to_string(i));
+    if (i % 100 == 0) rig.turns();
+  }
+  peer.room = MemoryPeer::kAll;
+  rig.turns(50);
+  EXPECT_EQ(events(peer.take()), "pa pb pa ") << "the first one was on its way";
 }
 
 // --- limits
