@@ -27,7 +27,7 @@ std::vector<Field> readable_fields_untrusted(const TypeInfo& type);
 Result<std::vector<Field>> select_fields(std::vector<Field> fields,
                                          const std::vector<std::string>& wanted);
 
-// The field, or the element of it, that `wanted` names: "pose.x", "ranges[3]". Empty: there is none.
+// The field that `wanted` names, or the element of it: "pose.x", "ranges[3]". Empty: there is none.
 struct FieldElement {
   Field field;
   std::optional<std::uint64_t> element;  // empty: the whole field
