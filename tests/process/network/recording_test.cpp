@@ -45,8 +45,9 @@ constexpr Duration kWrittenWithin = 1s + (kSlowness > 1 ? 8s : 2s);
 // What a ring holds for so long is not lost on a busy machine.
 constexpr Duration kLongHistory = 5s;
 
-// By then a program has opened its streams, and does not end any more when dssmd does.
-constexpr Duration kStartTime = 2s;
+// By then a program has begun, and does not end any more when dssmd does. Each dssmd that begins
+// answers after 3 s at the latest (kPatientRecovery), and programs wait for an answer for 5 s.
+constexpr Duration kStartTime = 10s;
 
 // A clock that hardly moves while this machine stalls: it counts pauses of 10 ms.
 class Ticks {
@@ -180,8 +181,6 @@ class RecordingSoak : public NetworkTest {
     std::string log;  // a file: what it printed
     int kills = 0;
     Duration started{};  // of Ticks
-    // dssmd was killed while it started, so that it may have ended for that reason.
-    bool may_end = false;
   };
 
   void begin(Program& program, std::vector<std::string> words, const std::string& log) {
@@ -190,19 +189,19 @@ class RecordingSoak : public NetworkTest {
                                  built("client/dssmctl/dssmctl")});
     program.pid = start(words, {fleet->dssmd(kRecorder).environment()});
     program.started = ticks_.now();
-    program.may_end = false;
   }
   static std::string text_of(const std::string& file) {
     std::ostringstream text;
     text << std::ifstream(file).rdbuf();
     return text.str();
   }
-  // Kills it; it must have run until now.
+  // Kills it; it must have run until now, or have started while dssmd was killed.
   void kill(Program& program, const char* what) {
     ::kill(program.pid, SIGKILL);
     const int status = wait_for(std::exchange(program.pid, -1));
-    const bool may_be = status == 128 + SIGKILL || (status == 1 && program.may_end);
-    EXPECT_TRUE(may_be) << what << " ended by itself: " << text_of(program.log);
+    const bool may_end = ticks_.now() - std::min(program.started, dssmd_killed_) < kStartTime;
+    EXPECT_TRUE(status == 128 + SIGKILL || (status == 1 && may_end))
+        << what << " ended by itself: " << text_of(program.log);
     ++program.kills;
   }
   // Of what ended because dssmd was killed while it started, as a service manager does.
@@ -226,10 +225,7 @@ class RecordingSoak : public NetworkTest {
   void kill_dssmd(int host) {
     fleet->kill_dssmd(host);
     ++dssmd_kills_;
-    if (host != kRecorder) return;
-    for (Program* program : {&recorder_, &player_}) {
-      if (ticks_.now() - program->started < kStartTime) program->may_end = true;
-    }
+    if (host == kRecorder) dssmd_killed_ = ticks_.now();
   }
   static void end(Program& program) {
     if (program.pid < 0) return;
@@ -429,6 +425,7 @@ class RecordingSoak : public NetworkTest {
   std::uint64_t lives_[kOwners] = {};
   std::string recording_, to_play_;
   int recordings_ = 0, dssmd_kills_ = 0;
+  Duration dssmd_killed_{};                     // of Ticks: that of the recorder
   std::map<std::string, Announced> announced_;  // of recording_, by the stream
   FollowerGroup groups_[2] = {FollowerGroup(ticks_), FollowerGroup(ticks_)};  // on pc1, pc3
   std::uint64_t files_ = 0, samples_ = 0, lost_ = 0, observed_ = 0, checked_ = 0, recoveries_ = 0;
