@@ -341,6 +341,34 @@ TEST_F(Record, LeavesAFileThatOpensWhenItIsKilled) {
   EXPECT_EQ(ctl({"info", file_}).err, "");
 }
 
+TEST_F(Record, EndsWithAWholeFileWhenTheDiskIsFull) {
+  auto pose = session_.create<RecordedPose>("pose", depth_of(100'000)).value();
+  std::vector<std::string> words = argv({"record", "--compression", "none", "-o", file_});
+  // No file may become longer, which is as a full disk is.
+  words.insert(words.begin(), {"env", "--ignore-signal=XFSZ", "prlimit", "--fsize=3000000"});
+  Running running(words, environment());
+  await_reader(pose.id());
+  std::int64_t written = 0;
+  const std::string first = running.line([&] {
+    if (written == 100'000) return;  // no more than its ring holds, and more than the file can
+    write_poses(pose, written, written + 99);
+    written += 100;
+  });
+  const std::string text = first + "\n" + running.rest();
+  EXPECT_EQ(running.status(), 1) << text;
+  EXPECT_TRUE(contains(text, file_ + "': File too large; nothing more is recorded. ")) << text;
+  EXPECT_TRUE(contains(text, "is a whole file with what was written before. Free space")) << text;
+
+  const Recording recording = Recording::open(file_).value();
+  EXPECT_EQ(recording.warnings(), std::vector<std::string>());
+  const std::uint64_t samples = recording.streams()[0].samples;
+  EXPECT_TRUE(contains(text, std::to_string(samples) + " samples of 1 stream, ")) << text;
+  RecordedReader<RecordedPose> reader = recorded(file_, "pose");
+  EXPECT_GT(samples, 10'000U);
+  expect_poses(reader, 0, static_cast<std::int64_t>(samples) - 1);
+  EXPECT_FALSE(reader.read_next());
+}
+
 TEST_F(Record, EndsInTimeAndShowsNumbersForPrograms) {
   auto pose = session_.create<RecordedPose>("pose", depth_of(64)).value();
   const Json summary = json({"record", "--for", "50ms", "-o", folder_.path()});

@@ -51,7 +51,9 @@ std::uint64_t KnownStream::life(std::span<const std::byte> payload) { return wor
 std::string KnownStream::fault(std::span<const std::byte> payload, const SampleInfo& info,
                                std::uint64_t life) const {
   const auto sample = [&] { return "'" + id.str() + "' tid " + std::to_string(info.tid) + ": "; };
-  const SampleInfo right = this->info(info.tid);
+  const Tid tid =
+      is_played ? (to_ns(info.time) - kFirstTimeNs + cycle.count() / 2) / cycle.count() : info.tid;
+  const SampleInfo right = this->info(tid);
   if (info.time != right.time) {
     return sample() + "time " + std::to_string(to_ns(info.time)) + " instead of " +
            std::to_string(to_ns(right.time));
@@ -64,7 +66,7 @@ std::string KnownStream::fault(std::span<const std::byte> payload, const SampleI
     return sample() + "of life " + std::to_string(KnownStream::life(payload)) + " instead of " +
            std::to_string(life);
   }
-  std::uint64_t word = mix(mix(number ^ (life << 20)) ^ static_cast<std::uint64_t>(info.tid));
+  std::uint64_t word = mix(mix(number ^ (life << 20)) ^ static_cast<std::uint64_t>(tid));
   for (std::size_t index = 1; index < payload.size() / 8; ++index, word += kStep) {
     if (word_of(payload, index) != word) {
       return sample() + "word " + std::to_string(index) + " is " +

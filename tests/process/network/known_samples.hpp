@@ -22,6 +22,10 @@ struct KnownStream {
       jitter{};  // greatest difference from the regular times; above the cycle, times sometimes
                  // decrease
   std::uint64_t number = 0;  // differs between the streams of a test
+  // Its samples are played from a recording of the stream, in any order, with times and payloads of
+  // the original ones and tids of their own: the original tid is computed from the time. The jitter
+  // must be less than half of the cycle.
+  bool is_played = false;
 
   TypeInfo type() const { return {"", payload_bytes, 8, {}}; }
   History history() const { return {depth, cycle}; }

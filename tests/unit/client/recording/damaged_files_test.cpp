@@ -19,23 +19,6 @@ using recording::Encoder;
 using recording::kRecordHeadBytes;
 using recording::Op;
 
-struct FoundRecord {
-  Op op;
-  std::size_t start, end;
-};
-
-std::vector<FoundRecord> records_of(std::string_view file) {
-  std::vector<FoundRecord> records;
-  for (std::size_t at = recording::kMagic.size(); at + kRecordHeadBytes < file.size();) {
-    std::uint64_t length = 0;
-    std::memcpy(&length, file.data() + at + 1, sizeof length);
-    const std::size_t end = at + kRecordHeadBytes + length;
-    records.push_back({static_cast<Op>(file[at]), at, end});
-    at = end;
-  }
-  return records;
-}
-
 class DamagedFiles : public RecordingTest {
  protected:
   // Two streams in some chunks, with a property and gaps; returns what was written.
@@ -62,10 +45,6 @@ class DamagedFiles : public RecordingTest {
     return written;
   }
 };
-
-bool begins_with(const std::vector<Recorded>& all, const std::vector<Recorded>& first) {
-  return first.size() <= all.size() && std::equal(first.begin(), first.end(), all.begin());
-}
 
 TEST_F(DamagedFiles, CutAtAnyByteLoseOnlyTheOpenChunk) {
   for (const Compression compression : {Compression::none, Compression::lz4, Compression::zstd}) {

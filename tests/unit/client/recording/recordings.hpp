@@ -6,6 +6,8 @@
 #include <gtest/gtest.h>
 #include <unistd.h>
 
+#include <algorithm>
+#include <cstring>
 #include <dssm/recording.hpp>
 #include <filesystem>
 #include <fstream>
@@ -13,6 +15,8 @@
 #include <random>
 #include <string>
 #include <vector>
+
+#include "client/recording/records.hpp"
 
 namespace dssm::test {
 
@@ -108,6 +112,28 @@ inline void write_file(const std::filesystem::path& path, std::string_view conte
   std::filesystem::remove(path);  // ext4 flushes a file that is truncated and written again
   std::ofstream(path, std::ios::binary)
       .write(content.data(), static_cast<std::streamsize>(content.size()));
+}
+
+struct FoundRecord {
+  recording::Op op;
+  std::size_t start, end;
+};
+
+// All records of an MCAP file.
+inline std::vector<FoundRecord> records_of(std::string_view file) {
+  std::vector<FoundRecord> records;
+  for (std::size_t at = recording::kMagic.size(); at + recording::kRecordHeadBytes < file.size();) {
+    std::uint64_t length = 0;
+    std::memcpy(&length, file.data() + at + 1, sizeof length);
+    const std::size_t end = at + recording::kRecordHeadBytes + length;
+    records.push_back({static_cast<recording::Op>(file[at]), at, end});
+    at = end;
+  }
+  return records;
+}
+
+inline bool begins_with(const std::vector<Recorded>& all, const std::vector<Recorded>& first) {
+  return first.size() <= all.size() && std::equal(first.begin(), first.end(), all.begin());
 }
 
 }  // namespace dssm::test
