@@ -7,6 +7,7 @@
 #include <array>
 #include <cmath>
 #include <cstdint>
+#include <limits>
 
 #include "client/dssmctl/text.hpp"
 #include "core/base/time.hpp"
@@ -79,7 +80,8 @@ std::vector<std::string> draw_chart(const std::vector<ChartPoint>& points, Time 
   const auto is_shown = [&](const ChartPoint& point) {
     return point.time >= begin && point.time <= end && std::isfinite(point.value);
   };
-  double least = INFINITY, greatest = -INFINITY;
+  constexpr double kInfinity = std::numeric_limits<double>::infinity();
+  double least = kInfinity, greatest = -kInfinity;
   for (const ChartPoint& point : points) {
     if (!is_shown(point)) continue;
     least = std::min(least, point.value), greatest = std::max(greatest, point.value);

@@ -3,14 +3,13 @@
 // dssmctl plot: fields of streams as curves over time, on the terminal or in a file.
 #include <fmt/format.h>
 #include <langinfo.h>
+#include <locale.h>
 #include <sys/ioctl.h>
 #include <unistd.h>
 
 #include <algorithm>
-#include <clocale>
 #include <cmath>
 #include <cstring>
-#include <thread>
 
 #include "client/dssmctl/chart.hpp"
 #include "client/dssmctl/draw.hpp"
@@ -145,6 +144,15 @@ std::string value_text(const Curve& curve) {
   return curve.points().empty() ? "-" : fmt::format("{:.9g}", curve.points().back().value);
 }
 
+// Whether the terminal's characters are Unicode's, by the locale of this process.
+bool knows_braille() {
+  const locale_t locale = ::newlocale(LC_CTYPE_MASK, "", nullptr);
+  if (!locale) return false;
+  const bool is_utf8 = std::strcmp(::nl_langinfo_l(CODESET, locale), "UTF-8") == 0;
+  ::freelocale(locale);
+  return is_utf8;
+}
+
 // All curves, one below the other, as high as the terminal has room.
 void print_charts(const std::vector<Curve>& curves, Time end, Duration span, Output& out) {
   winsize window{};
@@ -155,7 +163,7 @@ void print_charts(const std::vector<Curve>& curves, Time end, Duration span, Out
   // A title for each, the time axis, and the line in which the cursor stands.
   const std::size_t used = curves.size() + 2;
   size.rows = std::max<std::size_t>(rows > used ? (rows - used) / curves.size() : 0, 2);
-  const bool plain = std::strcmp(::nl_langinfo(CODESET), "UTF-8") != 0;
+  const bool plain = !knows_braille();
   for (const Curve& curve : curves) {
     out.add(fmt::format("{}  {}\n", out.bold(escaped(curve.name())), value_text(curve)));
     for (const std::string& line : draw_chart(curve.points(), end, span, size, plain)) {
@@ -220,7 +228,6 @@ Result<void> plot_file(std::vector<Curve>& curves, const PlotOptions& options, O
 }  // namespace
 
 Result<void> run(const PlotOptions& options, Output& out) {
-  ::setlocale(LC_CTYPE, "");  // whether the terminal knows Braille
   std::vector<std::string> streams, fields;
   {
     Session session = DSSM_TRY(connect(options));

@@ -255,8 +255,8 @@ ReadStatus RawReader::read_previous(std::span<std::byte> payload, SampleInfo& in
   return status;
 }
 
-[[gnu::flatten]] ReadStatus RawReader::read_at(Time t, std::span<std::byte> payload, SampleInfo& info,
-                              Duration max_age) noexcept {
+[[gnu::flatten]] ReadStatus RawReader::read_at(Time t, std::span<std::byte> payload,
+                                               SampleInfo& info, Duration max_age) noexcept {
   if (max_age == kAnyAge) {  // apart, so that a read without a maximum age costs nothing more
     return read_by_time(*state_, payload, info,
                         [&](Tid& chosen) { return state_->ring.find(t, chosen); });

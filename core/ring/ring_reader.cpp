@@ -95,7 +95,7 @@ bool RingReader::still_valid(const std::atomic<std::uint64_t>& sequence,
 }
 
 [[gnu::flatten, gnu::hot]] ReadStatus RingReader::read_newest(std::span<std::byte> payload,
-                                                SampleInfo& info) const noexcept {
+                                                              SampleInfo& info) const noexcept {
   for (int attempt = 0; attempt < kMaxRetries; ++attempt) {
     const Tid top = newest();
     if (top < 0) return ReadStatus::not_yet;
