@@ -141,7 +141,7 @@ std::string gnuplot_text(const std::vector<NamedCurve>& curves, std::string_view
   const auto seconds = [&](Time time) { return static_cast<double>(to_ns(time - begin)) * 1e-9; };
   std::string text = fmt::format(
       "set terminal {} size {},{} noenhanced\nset output {}\nset multiplot layout {},1\n"
-      "set grid\nset lmargin 12\nset xrange [0:{}]\nset datafile missing 'nan'\n",
+      "set grid\nset lmargin 12\nset xrange [0:{}]\n",
       format == "png" ? "pngcairo" : "svg background 'white'", 1000, 60 + 240 * curves.size(),
       quoted(file), curves.size(), end > begin ? seconds(end) : 1);
   for (std::size_t i = 0; i < curves.size(); ++i) {
@@ -154,7 +154,7 @@ std::string gnuplot_text(const std::vector<NamedCurve>& curves, std::string_view
                         quoted(escaped(curve.name)));
     for (const ChartPoint& point : curve.points) {
       text += fmt::format("{:.9f} {}\n", seconds(point.time),
-                          std::isfinite(point.value) ? fmt::format("{}", point.value) : "nan");
+                          std::isfinite(point.value) ? fmt::format("{}", point.value) : "NaN");
     }
     text += "e\n";
   }

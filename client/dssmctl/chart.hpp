@@ -22,13 +22,13 @@ struct ChartSize {
 
 // Draws `points`, in the order of time, as far as they are within `span` before `end`: a line per
 // row, the greatest and the least value at its left, and the curve from one sample to the next.
-// Values that are no numbers interrupt it.
+// Values that are not numbers interrupt it.
 //   plain  stars in place of Braille, for terminals without UTF-8
 std::vector<std::string> draw_chart(const std::vector<ChartPoint>& points, Time end, Duration span,
                                     const ChartSize& size, bool plain);
 
 // The same for a program that draws files: what gnuplot(1) reads. Each curve has its own axes, one
-// below the other.
+// below the other. It makes a gap where a value is not a number.
 struct NamedCurve {
   std::string name;
   std::vector<ChartPoint> points;

@@ -14,7 +14,7 @@
 namespace dssm::ctl {
 
 Result<void> draw(const std::string& file, std::vector<std::string> command,
-                  const std::string& text, const std::string& without) {
+                  const std::string& text, const std::string& install_hint) {
   int ends[2];
   if (::pipe2(ends, O_CLOEXEC)) return os_error("pipe2");
   UniqueFd from(ends[0]), to(ends[1]);
@@ -30,7 +30,7 @@ Result<void> draw(const std::string& file, std::vector<std::string> command,
   ::posix_spawn_file_actions_destroy(&actions);
   if (failed == ENOENT) {
     return Error{Errc::not_found, fmt::format("draw '{}': there is no program '{}' here; {}", file,
-                                              command.front(), without)};
+                                              command.front(), install_hint)};
   }
   if (failed) return os_error(fmt::format("run '{}'", command.front()), failed);
   from = UniqueFd();
@@ -45,7 +45,7 @@ Result<void> draw(const std::string& file, std::vector<std::string> command,
   }
   if (WIFEXITED(status) && WEXITSTATUS(status) == 0) return {};
   return Error{Errc::system,
-               fmt::format("draw '{}': '{}' failed; it says above why", file, command.front())};
+               fmt::format("draw '{}': '{}' failed; see its message above", file, command.front())};
 }
 
 }  // namespace dssm::ctl

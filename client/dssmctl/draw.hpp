@@ -10,9 +10,9 @@
 namespace dssm::ctl {
 
 // Runs `command`, which reads `text` and writes `file`; what it reports goes to standard error.
-//   without  what to do when there is no such program, for people
-//   fails    not_found (no such program), system
+//   install_hint  what to do when there is no such program, for people
+//   fails         not_found (no such program), system
 Result<void> draw(const std::string& file, std::vector<std::string> command,
-                  const std::string& text, const std::string& without);
+                  const std::string& text, const std::string& install_hint);
 
 }  // namespace dssm::ctl

@@ -66,7 +66,7 @@ std::optional<std::uint64_t> sleep_count_of_all(pid_t process, const std::set<pi
 }
 
 // Whether there is a moment at which all these threads sleep. One that is asked early may be woken
-// by one that is asked late: none may have slept anew until it is asked again.
+// by one that is asked late: none may have slept again until it is asked again.
 bool are_all_asleep(pid_t process, const std::set<pid_t>& except) {
   const auto count = sleep_count_of_all(process, except);
   return count && sleep_count_of_all(process, except) == count;
@@ -244,8 +244,11 @@ std::uint64_t Lockstep::turns_taken(const Program& program) noexcept {
 
 bool Lockstep::is_waiting(Program& program, bool with_all_threads, bool accept_elsewhere) {
   LockstepPage& page = program.page();
-  const std::uint32_t requests = page.requests_ended.load();
-  if (page.requests_begun.load() != requests && !accept_elsewhere) return false;
+  const std::uint64_t turns = turns_taken(program);
+  const std::uint32_t begun = page.requests_begun.load();
+  const std::uint32_t open_requests = begun - page.requests_ended.load();
+  if (accept_elsewhere) program.lost_requests = open_requests;  // of a process that was killed
+  if (open_requests != program.lost_requests) return false;
   std::set<pid_t> processes, waiting;
   for (LockstepPlace& place : page.places) {
     const std::uint32_t state = place.state.load();
@@ -276,8 +279,13 @@ bool Lockstep::is_waiting(Program& program, bool with_all_threads, bool accept_e
   }
   if (!with_all_threads) return true;
   const auto sleeps = [&](pid_t process) { return are_all_asleep(process, waiting); };
-  return std::all_of(processes.begin(), processes.end(), sleeps) &&
-         (page.requests_begun.load() == requests || accept_elsewhere);
+  if (!std::all_of(processes.begin(), processes.end(), sleeps)) return false;
+  // None of them did anything while the others were asked.
+  const auto is_there = [&](const LockstepPlace& place) {
+    return place.state.load() == LockstepPlace::waiting || !waiting.contains(place.thread.load());
+  };
+  return std::all_of(std::begin(page.places), std::end(page.places), is_there) &&
+         turns_taken(program) == turns && (accept_elsewhere || page.requests_begun.load() == begun);
 }
 
 Result<bool> Lockstep::await(Program& program, bool with_all_threads) {

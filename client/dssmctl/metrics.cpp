@@ -5,7 +5,7 @@
 // asked for costs nothing.
 //
 // Labels are names of hosts, streams and limits only, so that the number of series is bounded by
-// that of the streams. What is not known has no sample, as the age of a stream whose host does not
+// that of the streams. What is not known has no sample, as the streams of a host that does not
 // answer.
 #include <fmt/format.h>
 #include <unistd.h>
@@ -109,13 +109,13 @@ void add_process(std::string& text, std::int32_t pid) {
       .add("", ticks(14) + ticks(15));
   Family(text, "dssm_daemon_resident_memory_bytes", "gauge", "Memory of dssmd, rings included.")
       .add("", std::stod(field[24]) * static_cast<double>(::sysconf(_SC_PAGESIZE)));
-  timespec since_boot{};
-  ::clock_gettime(CLOCK_BOOTTIME, &since_boot);
-  const double boot = static_cast<double>(to_ns(WallClock::now())) * 1e-9 -
-                      static_cast<double>(since_boot.tv_sec) -
-                      static_cast<double>(since_boot.tv_nsec) * 1e-9;
-  Family(text, "dssm_daemon_start_time_seconds", "gauge", "When dssmd was started, since 1970.")
-      .add("", boot + ticks(22));
+  std::ifstream system("/proc/stat");
+  for (std::string line; std::getline(system, line);) {
+    constexpr std::string_view kBoot = "btime ";
+    if (!line.starts_with(kBoot)) continue;
+    Family(text, "dssm_daemon_start_time_seconds", "gauge", "When dssmd was started, since 1970.")
+        .add("", std::stod(line.substr(kBoot.size())) + ticks(22));
+  }
 }
 
 void add_daemon(std::string& text, const DaemonInfo& daemon) {
@@ -235,7 +235,8 @@ void add_mirrors(std::string& text, const std::vector<StreamInfo>& mirrored) {
       [](const MirrorInfo& mirror) { return mirror.received_bytes; });
   add("dssm_mirror_lost_samples", "Samples of another host's stream that did not come here.",
       [](const MirrorInfo& mirror) { return mirror.gap_samples; });
-  add("dssm_mirror_reconnects", "How often the connection that carries the stream was made anew.",
+  add("dssm_mirror_reconnects",
+      "How often the connection that carries the stream was replaced by a new one.",
       [](const MirrorInfo& mirror) { return mirror.reconnects; });
 }
 
@@ -251,7 +252,11 @@ Result<void> run(const MetricsOptions& options, Output& out) {
     return host.name.empty() || host.reason == HostReason::spare_address ||
            !names.insert(host.name).second;
   });
-  const std::vector<StreamInfo> streams = DSSM_TRY(session.list_streams());
+  std::vector<StreamInfo> streams = DSSM_TRY(session.list_streams());
+  // Of a host that does not answer: a count of 0 would be taken for a new stream.
+  std::erase_if(streams, [](const StreamInfo& stream) {
+    return stream.state == StreamState::unknown && stream.newest == kNoTid;
+  });
   std::vector<StreamInfo> mirrored;
   for (const StreamInfo& stream : streams) {
     if (stream.id.host == daemon.host) continue;

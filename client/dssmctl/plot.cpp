@@ -62,6 +62,8 @@ class Curve {
       }
       is_arriving_ = status == ReadStatus::not_yet && reader.newest_tid() > reader.cursor();
       if (status != ReadStatus::ok) break;
+      // A recording that is played again or backwards: the curve begins again at that time.
+      while (!points_.empty() && points_.back().time > info.time) points_.pop_back();
       if (reader.lost_samples() != lost && !points_.empty()) {
         points_.push_back({info.time, NAN});  // no line over what is missing
       }
@@ -106,11 +108,12 @@ class Curve {
     return {};
   }
 
-  // Every second one goes.
+  // Every second one goes, but for gaps.
   void thin() {
-    std::size_t kept = 0;
-    for (std::size_t i = 0; i < points_.size(); i += 2) points_[kept++] = points_[i];
-    points_.resize(kept);
+    std::size_t number = 0;
+    std::erase_if(points_, [&](const ChartPoint& point) {
+      return ++number % 2 == 0 && std::isfinite(point.value);
+    });
   }
 
   std::string target_;
@@ -212,16 +215,22 @@ Result<void> plot_file(std::vector<Curve>& curves, const PlotOptions& options, O
   } while (!is_complete() && out.sleep_until(deadline_in(std::chrono::milliseconds(50))));
   std::vector<NamedCurve> named;
   for (const Curve& curve : curves) {
-    if (curve.points().empty()) {
-      return Error{Errc::not_found,
-                   fmt::format("draw '{}': nothing was written to the stream yet; --for 10s waits "
-                               "for what comes",
-                               escaped(curve.name()))};
+    const bool has_value =
+        std::any_of(curve.points().begin(), curve.points().end(),
+                    [](const ChartPoint& point) { return std::isfinite(point.value); });
+    if (!has_value) {
+      return Error{
+          Errc::not_found,
+          fmt::format("draw '{}': {}; --for 10s waits for what comes", escaped(curve.name()),
+                      curve.points().empty() ? "nothing was written to the stream yet"
+                                             : "it was not a number at any time")};
     }
     named.push_back({curve.name(), curve.points()});
   }
   const std::string format = options.out.substr(options.out.rfind('.') + 1);
-  return draw(options.out, {"gnuplot"}, gnuplot_text(named, format, options.out),
+  // gnuplot would run what is after a '|'.
+  const std::string file = options.out.starts_with('|') ? "./" + options.out : options.out;
+  return draw(options.out, {"gnuplot"}, gnuplot_text(named, format, file),
               "install gnuplot (`sudo apt install gnuplot-nox`)");
 }
 
@@ -246,7 +255,9 @@ Result<void> run(const PlotOptions& options, Output& out) {
   if (!options.out.empty()) return plot_file(curves, options, out);
   const bool is_drawn = out.terminal() && !options.json;
   const MonoTime end = options.duration ? deadline_in(*options.duration) : kNever;
-  for (MonoTime next = MonoClock::now();; next += is_drawn ? kScreenPeriod : kRowPeriod) {
+  const Duration period = is_drawn ? kScreenPeriod : kRowPeriod;
+  // After a pause of this program not for each period that it missed.
+  for (MonoTime next = MonoClock::now();; next = std::max(next + period, MonoClock::now())) {
     if (!out.sleep_until(std::min(next, end))) return {};
     DSSM_TRY(read_all(curves, options.span));
     Time newest = Time::min();

@@ -69,12 +69,16 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
   const std::string name = event.stream.id.str();
   const std::lock_guard lock(mutex_);
   if (event.kind == StreamEvent::Kind::added && wants(event.stream)) {
+    const auto known = known_.find(name);
     if (event.property_set) {
-      want_property({event.stream, event.stream.newest, MonoClock::now()});
-    } else if (known_.contains(name) && event.stream.property_bytes > 0) {
-      // Its host is there again, or it was created again: the reader goes on by itself.
-      want_property({event.stream, std::nullopt, MonoClock::now()});
+      want_property({event.stream, event.property_after, MonoClock::now()});
+    } else if (known != known_.end() && event.stream.property_bytes > 0) {
+      // It was created again, or its host is there again. Its reader continues.
+      const bool is_new = known->second != event.stream.incarnation;
+      want_property(
+          {event.stream, is_new ? std::optional(kNoTid) : std::nullopt, MonoClock::now()});
     }
+    if (known != known_.end()) known->second = event.stream.incarnation;
   }
   const auto is_it = [&](const Wanted& wanted) { return wanted.stream.id == event.stream.id; };
   std::erase_if(removed_, [&](const auto& entry) { return entry.first == event.stream.id; });
@@ -118,12 +122,13 @@ void Recorder::Opener::fetch_property(std::unique_lock<std::mutex>& lock,
     }
   }
   lock.lock();
+  // One that was set meanwhile may be what dssmd has answered, for the earlier samples.
+  const bool is_last = std::ranges::none_of(
+      set_properties_, [&](const SetProperty& later) { return later.stream.id == stream.id; });
+  if (!is_last) return;
   if (!error) {
     properties_.emplace_back(stream.id, std::move(property));
-  } else if (is_retryable(error->code) && !stop_at_ &&
-             std::ranges::none_of(set_properties_, [&](const SetProperty& later) {
-               return later.stream.id == stream.id;
-             })) {
+  } else if (is_retryable(error->code) && !stop_at_) {
     want_property({stream, wanted.after, deadline_in(kRetryPeriod)});
   }
 }
@@ -166,7 +171,9 @@ void Recorder::Opener::run() {
   while (true) {
     const auto next = next_wanted();
     const auto property = std::ranges::min_element(set_properties_, {}, &SetProperty::due);
-    const bool is_stream = next != wanted_.end(), is_property = property != set_properties_.end();
+    const bool is_stream = next != wanted_.end();
+    const bool is_property =
+        property != set_properties_.end() && (!stop_at_ || property->due <= *stop_at_);
     if (stop_at_ && ((!is_stream && !is_property) || MonoClock::now() >= *stop_at_)) return;
     if (!is_stream && !is_property) {
       changed_.wait(lock);
@@ -195,7 +202,7 @@ void Recorder::Opener::run() {
     const bool is_wanted = entry != wanted_.end();
     if (is_wanted && entry->from_start && !entry->reported) --untried_;
     if (opened) {  // the reader has the samples of its ring, and follows a new one
-      known_.insert(wanted.stream.id.str());
+      known_[wanted.stream.id.str()] = wanted.stream.incarnation;
       if (is_wanted) wanted_.erase(entry);
       opened_.push_back(*std::move(opened));
       continue;
@@ -385,7 +392,7 @@ void Recorder::add_property(const StreamId& id, NewProperty property) {
     const bool is_here = property.incarnation == source->reader.incarnation();
     property.after = is_here ? source->reader.newest_tid() : kNoTid;
   }
-  property.newest_time = newest_time_;
+  if (source->is_of_now) property.newest_time = newest_time_;
   property.came = MonoClock::now();
   std::vector<NewProperty>& all = source->new_properties;
   // Its ring has been replaced since.
@@ -393,6 +400,10 @@ void Recorder::add_property(const StreamId& id, NewProperty property) {
     return earlier.incarnation != property.incarnation &&
            earlier.incarnation != source->reader.incarnation();
   });
+  // Set again before there was another sample: the last one counts.
+  const bool is_same_place = !all.empty() && all.back().incarnation == property.incarnation &&
+                             all.back().after == property.after;
+  if (is_same_place) all.pop_back();
   all.push_back(std::move(property));
 }
 
@@ -557,8 +568,11 @@ Result<void> Recorder::complete() {
     // A host that is lost must not keep the next file waiting.
     if (!is_on_demand_ || MonoClock::now() < end) {
       if (Result<std::vector<std::byte>> property = reader.property()) {
-        source.new_properties.push_back(
-            {reader.incarnation(), reader.newest_tid(), *std::move(property), newest_time_, {}});
+        source.new_properties.push_back({reader.incarnation(),
+                                         reader.newest_tid(),
+                                         *std::move(property),
+                                         source.is_of_now ? newest_time_ : Time::min(),
+                                         {}});
       }
     }
     taken = write_properties(source, true);

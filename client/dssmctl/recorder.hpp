@@ -14,6 +14,7 @@
 #include <cstdint>
 #include <dssm/recording.hpp>
 #include <dssm/session.hpp>
+#include <map>
 #include <memory>
 #include <mutex>
 #include <optional>
@@ -189,7 +190,8 @@ class Recorder {
     std::condition_variable changed_;
     bool is_beginning_ = true;  // begin() runs: what comes is there already
     std::vector<Wanted> wanted_;
-    std::set<std::string> known_;  // names of what was opened: they restart by themselves
+    // Names and incarnations of what was opened: they restart by themselves.
+    std::map<std::string, std::uint64_t> known_;
     std::vector<std::pair<StreamId, MonoTime>> removed_;  // of these, and when
     std::size_t untried_ = 0;
     std::vector<Source> opened_;

@@ -85,6 +85,7 @@ struct Content {
 
   Result<void> add(std::uint32_t file);
   void add_properties(std::size_t stream, std::uint32_t file, const FileChannel& channel);
+  Time first_time(std::uint32_t file, std::uint16_t channel) const;
   // The index of a property is that in RecordedStreamInfo::property_times. With the mutex held.
   Result<std::vector<std::byte>> property(std::size_t stream, std::size_t index);
   void finish();
@@ -191,6 +192,17 @@ Result<void> Content::add(std::uint32_t number) {
   return {};
 }
 
+// The least time of the channel in that file; the greatest of all times: it has no sample there.
+Time Content::first_time(std::uint32_t file, std::uint16_t channel) const {
+  Time first = Time::max();
+  for (const auto& chunk : files[file]->chunks()) {
+    for (const Part& part : chunk.parts) {
+      if (part.channel == channel) first = std::min(first, time_from_ns(part.min_time_ns));
+    }
+  }
+  return first;
+}
+
 // A file begins with the property that the stream had in the file before.
 void Content::add_properties(std::size_t stream, std::uint32_t file, const FileChannel& channel) {
   if (channel.properties.empty()) return;
@@ -201,6 +213,9 @@ void Content::add_properties(std::size_t stream, std::uint32_t file, const FileC
   for (std::size_t i = is_repeated ? 1 : 0; i < channel.properties.size(); ++i) {
     PropertyPlace place = channel.properties[i];
     place.file = file;
+    // What a file begins with holds for its own samples, as of an incident some time after another.
+    if (place.from == Time::min() && !all.empty())
+      place.from = first_time(file, channel.channel.id);
     add_property(all, place);
   }
   about.property = channel.stream->property;

@@ -68,7 +68,9 @@ void StreamWatches::on_message(const local::Response& message) {
 
 void StreamWatches::on_event(const proto::StreamEvent& message) {
   StreamEvent event{message.removed() ? StreamEvent::Kind::removed : StreamEvent::Kind::added,
-                    wire::stream_info(message.stream()), false};
+                    wire::stream_info(message.stream()),
+                    false,
+                    {}};
   const std::string name = event.stream.id.str();
   const std::lock_guard guard(mutex_);
   unconfirmed_.erase(name);
@@ -81,6 +83,7 @@ void StreamWatches::on_event(const proto::StreamEvent& message) {
       event.property_set =
           message.property_set() || known.property_bytes != event.stream.property_bytes;
       if (!event.property_set) return;  // it has a description now
+      if (message.property_set()) event.property_after = event.stream.newest;
     }
   }
   for (const auto& [key, callback] : watches_) callback(event);

@@ -172,9 +172,11 @@ struct StreamEvent {
   Kind kind = Kind::added;
   StreamInfo stream;  // for removed: identity only
   // Added: the stream was known before, and its property was set, or removed (then
-  // stream.property_bytes is 0). Samples after stream.newest are written with the new one. Changes
-  // that follow each other closely may be reported once.
+  // stream.property_bytes is 0). Changes that follow each other closely may be reported once.
   bool property_set = false;
+  // For property_set: samples after this one are written with the new property; kNoTid: all are.
+  // Empty: that is not known, after a reconnect.
+  std::optional<Tid> property_after;
 };
 
 // How a stream is created.

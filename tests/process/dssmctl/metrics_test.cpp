@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // dssmctl metrics.
+#include <signal.h>
+
 #include <map>
-#include <set>
 
 #include "tests/process/dssmctl/fleet_test.hpp"
 
@@ -73,6 +74,18 @@ TEST_F(Metrics, HaveWhatIsKnownOfHostsStreamsAndDssmd) {
   const double now = static_cast<double>(to_ns(WallClock::now())) * 1e-9;
   EXPECT_GT(value("dssm_daemon_start_time_seconds"), now - 300);
   EXPECT_LT(value("dssm_daemon_start_time_seconds"), now + 1);
+}
+
+// A count of 0 would be taken for a new stream.
+TEST_F(Metrics, LeaveOutTheStreamsOfAHostThatDoesNotAnswer) {
+  auto lidar = on_pc2_.create<double>("lidar", depth_of(8)).value();
+  lidar.write(1);
+  await_streams(1);
+  const std::string name = R"(dssm_stream_samples_total{stream="lidar",id="0",host="pc2"})";
+  EXPECT_EQ(samples()[name], 1);
+  ASSERT_EQ(::kill(pc2_.pid(), SIGSTOP), 0);
+  EXPECT_FALSE(samples().contains(name));
+  ASSERT_EQ(::kill(pc2_.pid(), SIGCONT), 0);
 }
 
 // By the parser of Prometheus' own Python client.

@@ -435,6 +435,20 @@ TEST_F(RecordingFiles, RepeatThePropertyOfTheFileBeforeWithItsTime) {
   EXPECT_EQ(properties_of(open_recording(path(last)), stream), Texts{expected.back()});
 }
 
+// As a black box makes of two incidents.
+TEST_F(RecordingFiles, KeepThePropertyThatEachOfSeveralRecordingsBeganWith) {
+  for (const int number : {0, 1}) {
+    RecordingWriter writer =
+        RecordingWriter::create(path(std::to_string(number) + ".mcap")).value();
+    RecordedStream about = plain_stream("s", 24);
+    about.property = bytes_of(number == 0 ? "one" : "two");
+    const auto stream = writer.add_stream(about).value();
+    write(writer, stream, sample_at(10 * number, 100 * number + 5));
+    ASSERT_TRUE(writer.finish());
+  }
+  EXPECT_EQ(properties_of(open_recording(folder_), 0), (Texts{"begin one", "105 two"}));
+}
+
 // Before properties had times, each file began with one of time 0, and a change had the time of the
 // chunk before.
 TEST_F(RecordingFiles, OpenFromBeforePropertiesHadTimes) {
