@@ -16,7 +16,7 @@
 // A thread whose turn brought nothing (no sample, and not late enough) waits again at once.
 // Otherwise it counts the turn in `taken` and returns to the program.
 //
-// A thread that waits for an answer of dssmd sleeps, too, but goes on by itself: it is counted in
+// A thread that waits for an answer of dssmd sleeps, too, but is woken by that: it is counted in
 // `requests_begun` before that and in `requests_ended` after it.
 //
 // The environment variable of kVariable has the two descriptors: "MEMORY,EVENTFD".
