@@ -300,11 +300,18 @@ class Player {
   Result<void> set_property(std::size_t from, Time t) {
     Property& set = properties_[targets_[from]];
     const Property wanted{from, recording_.streams()[from].property_at(t)};
-    if (wanted.index && wanted != set) {
-      const std::vector<std::byte> property = DSSM_TRY(recording_.property(from, *wanted.index));
-      DSSM_TRY(session_.set_property(writers_[from]->id(), property));
-    } else if (!wanted.index && set.index) {
-      DSSM_TRY(session_.set_property(writers_[from]->id(), {}));
+    const bool is_new = wanted.index && wanted != set;
+    if (is_new || (!wanted.index && set.index)) {
+      std::vector<std::byte> property;
+      if (is_new) property = DSSM_TRY(recording_.property(from, *wanted.index));
+      const StreamId& id = writers_[from]->id();
+      const Result<void> done = session_.set_property(id, property);
+      // Its samples are played all the same: another host may be lost for a while.
+      if (!done) {
+        out_.clear_line();
+        print_notice(fmt::format("the property of '{}' is not set: {}", escaped(id.str()),
+                                 escaped_message(done.error().message)));
+      }
     }
     set = wanted;
     return {};

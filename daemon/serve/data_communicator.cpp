@@ -502,9 +502,9 @@ bool StreamWatch::work() {
   for (int sent = 0; !pending_.empty() && link_.output_empty(); ++sent) {
     if (sent == kStreamsPerTurn) return true;
     const std::shared_ptr<const Stream> stream = pending_.front().stream.lock();
-    const bool property_set = pending_.front().property_set;
+    const std::optional<Tid> property_after = pending_.front().property_after;
     pending_.pop_front();
-    if (stream && !stream->removed() && shows_(stream->id())) send_added(*stream, property_set);
+    if (stream && !stream->removed() && shows_(stream->id())) send_added(*stream, property_after);
   }
   if (!pending_.empty() || serial_ == 0 || registry_.may_miss_streams()) return false;
   net::Frame done;
@@ -515,9 +515,11 @@ bool StreamWatch::work() {
   return false;
 }
 
-void StreamWatch::send_added(const Stream& stream, bool property_set) {
+void StreamWatch::send_added(const Stream& stream, std::optional<Tid> property_after) {
   net::Frame frame;
-  *frame.mutable_stream_event() = added_event(stream, opens_, property_set);
+  proto::StreamEvent& event = *frame.mutable_stream_event();
+  event = added_event(stream, opens_, property_after.has_value());
+  if (property_after) event.mutable_stream()->set_newest(*property_after);
   link_.send(frame);
 }
 
@@ -533,11 +535,16 @@ void StreamWatch::on_stream_added(const Stream& stream) {
 // A program may set properties faster than the link takes events: then one is sent for several.
 void StreamWatch::on_property_set(const Stream& stream) {
   if (!shows_(stream.id())) return;
-  if (pending_.empty() && link_.output_empty()) return send_added(stream, true);
-  const bool is_pending = std::any_of(pending_.begin(), pending_.end(), [&](const Pending& one) {
-    return one.property_set && one.stream.lock().get() == &stream;
+  const Tid newest = added_event(stream, opens_, true).stream().newest();
+  if (pending_.empty() && link_.output_empty()) return send_added(stream, newest);
+  const auto pending = std::find_if(pending_.begin(), pending_.end(), [&](const Pending& one) {
+    return one.property_after && one.stream.lock().get() == &stream;
   });
-  if (!is_pending) pending_.push_back({stream.weak_from_this(), true});
+  if (pending != pending_.end()) {
+    pending->property_after = newest;
+  } else {
+    pending_.push_back({stream.weak_from_this(), newest});
+  }
 }
 
 // Also for one whose addition was not sent yet: a receiver ignores the removal of an unknown

@@ -64,9 +64,9 @@ class StreamWatch {
   // An event that waits for the link.
   struct Pending {
     std::weak_ptr<const Stream> stream;
-    bool property_set = false;
+    std::optional<Tid> property_after;  // its property was set, after that sample
   };
-  void send_added(const Stream& stream, bool property_set = false);
+  void send_added(const Stream& stream, std::optional<Tid> property_after = {});
   void send_removed(const Stream& stream);
 
   const Registry& registry_;
