@@ -142,7 +142,8 @@ TEST_F(Ls, SortsByWhatIsAskedAndByCreationOtherwise) {
   auto a = session_.create_raw({"a", 1, ""}, {"T3", 10, 1, {}}, depth_of(8)).value();
   auto c = session_.create_raw({"c", 2, ""}, {"T1", 20, 1, {}}, depth_of(2)).value();
   const std::vector<std::byte> payload(10);
-  a.write(payload, WallClock::now());
+  // Ages are looked at one after the other: the difference is greater than that takes.
+  a.write(payload, WallClock::now() - std::chrono::seconds(2));
   c.write(std::vector<std::byte>(20), WallClock::now());
   EXPECT_EQ(output({"ls", "--names"}), "b\na:1\nc:2\n");
   EXPECT_EQ(output({"ls", "--names", "--sort", "name"}), "a:1\nb\nc:2\n");

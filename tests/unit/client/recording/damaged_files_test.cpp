@@ -46,6 +46,13 @@ class DamagedFiles : public RecordingTest {
   }
 };
 
+// Sanitizers make each opening slow.
+#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
+constexpr std::size_t kCutStep = 7;
+#else
+constexpr std::size_t kCutStep = 1;
+#endif
+
 TEST_F(DamagedFiles, CutAtAnyByteLoseOnlyTheOpenChunk) {
   for (const Compression compression : {Compression::none, Compression::lz4, Compression::zstd}) {
     const std::vector<Recorded> written = make(path("whole.mcap"), compression);
@@ -62,7 +69,7 @@ TEST_F(DamagedFiles, CutAtAnyByteLoseOnlyTheOpenChunk) {
     ASSERT_GT(chunks.size(), 4U);
     EXPECT_EQ(chunks.rbegin()->second, written.size());
 
-    for (std::size_t length = 0; length < whole.size(); ++length) {
+    for (std::size_t length = 0; length < whole.size(); length += kCutStep) {
       SCOPED_TRACE(length);
       write_file(path("cut.mcap"), std::string_view(whole).substr(0, length));
       const Recording recording = open_recording(path("cut.mcap"));
@@ -70,7 +77,7 @@ TEST_F(DamagedFiles, CutAtAnyByteLoseOnlyTheOpenChunk) {
       const std::vector<Recorded> samples = all_of(recording);
       ASSERT_TRUE(begins_with(written, samples));
       ASSERT_EQ(samples.size(), std::prev(chunks.upper_bound(length))->second);
-      if (length % 97 != 0) continue;  // each syncs
+      if (length / kCutStep % 97 != 0) continue;  // each syncs
 
       const Result<RecordingRepair> repaired = repair_recording(path("cut.mcap"));
       if (!repaired) {  // there is nothing in it
