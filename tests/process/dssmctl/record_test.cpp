@@ -759,9 +759,13 @@ TEST_F(RoundTrip, OfRecordAndPlayKeepsAll) {
   EXPECT_EQ(properties_of(first),
             std::pair(Texts({"0 p0", "13 p1", "27 ", "40 p3"}), Texts({"7 b1", "13 b2", "20 "})));
 
-  Running record(argv({"record", "-o", second}), environment());
   file_ = first;
   play({"--start-paused"});
+  Running record(argv({"record", "-o", second}), environment());
+  await([&] {
+    const Result<Recording> begun = Recording::open(second);
+    return begun && begun->streams().size() == 2;
+  });
   for (std::int64_t i = 0; i < kSamples; ++i) {
     press(kRight);
     // Each property came with the first sample after it.
