@@ -15,21 +15,6 @@
 namespace dssm::ctl {
 namespace {
 
-void print_json(const std::vector<Finding>& findings, bool ok, Output& out) {
-  const auto status_name = [](Finding::Status status) {
-    return status == Finding::Status::ok ? "ok" : status == Finding::Status::warn ? "warn" : "fail";
-  };
-  Json checks = Json::array();
-  for (const Finding& finding : findings) {
-    checks.push_back({{"name", finding.name},
-                      {"status", status_name(finding.status)},
-                      {"text", finding.text},
-                      {"cause", or_null(finding.cause)},
-                      {"command", or_null(finding.command)}});
-  }
-  out.add(json_document({{"checks", std::move(checks)}, {"ok", ok}}));
-}
-
 void print_text(const std::vector<Finding>& findings, Output& out) {
   for (const Finding& finding : findings) {
     const std::string mark = finding.status == Finding::Status::ok     ? "OK    "
@@ -44,12 +29,31 @@ void print_text(const std::vector<Finding>& findings, Output& out) {
 
 }  // namespace
 
+Json findings_json(const std::vector<Finding>& findings) {
+  const auto status_name = [](Finding::Status status) {
+    return status == Finding::Status::ok ? "ok" : status == Finding::Status::warn ? "warn" : "fail";
+  };
+  Json checks = Json::array();
+  for (const Finding& finding : findings) {
+    checks.push_back({{"name", finding.name},
+                      {"status", status_name(finding.status)},
+                      {"text", finding.text},
+                      {"cause", or_null(finding.cause)},
+                      {"command", or_null(finding.command)}});
+  }
+  return checks;
+}
+
 Result<void> run(const DoctorOptions& options, Output& out) {
   const std::vector<Finding> findings = findings_of(collect_facts(options));
   const auto failed = std::count_if(findings.begin(), findings.end(), [](const Finding& finding) {
     return finding.status == Finding::Status::fail;
   });
-  options.json ? print_json(findings, failed == 0, out) : print_text(findings, out);
+  if (options.json) {
+    out.add(json_document({{"checks", findings_json(findings)}, {"ok", failed == 0}}));
+  } else {
+    print_text(findings, out);
+  }
   if (failed == 0) return {};
   return Error{Errc::system,
                fmt::format("{} of {} checks failed; run the commands shown, then run doctor again",

@@ -119,4 +119,6 @@ void check_streams(const Facts& facts, std::vector<Finding>& findings);
 // are no findings about what only it knows.
 std::vector<Finding> findings_of(const Facts& facts);
 
+Json findings_json(const std::vector<Finding>& findings);
+
 }  // namespace dssm::ctl

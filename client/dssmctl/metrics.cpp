@@ -21,6 +21,7 @@
 #include <utility>
 #include <vector>
 
+#include "client/dssmctl/metrics.hpp"
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/options.hpp"
 #include "core/base/time.hpp"
@@ -242,8 +243,7 @@ void add_mirrors(std::string& text, const std::vector<StreamInfo>& mirrored) {
 
 }  // namespace
 
-Result<void> run(const MetricsOptions& options, Output& out) {
-  Session session = DSSM_TRY(connect(options));
+Result<std::string> metrics_text(Session& session) {
   const DaemonInfo daemon = DSSM_TRY(session.daemon_info());
   std::vector<HostInfo> hosts = DSSM_TRY(session.list_hosts());
   // One that never answered has no name; one with several addresses is listed with each.
@@ -269,7 +269,12 @@ Result<void> run(const MetricsOptions& options, Output& out) {
   add_hosts(text, hosts);
   add_streams(text, streams);
   add_mirrors(text, mirrored);
-  out.add(text + "# EOF\n");
+  return text + "# EOF\n";
+}
+
+Result<void> run(const MetricsOptions& options, Output& out) {
+  Session session = DSSM_TRY(connect(options));
+  out.add(DSSM_TRY(metrics_text(session)));
   return {};
 }
 

@@ -31,6 +31,7 @@ ORDER = [
     ["client/src"],
     ["client/ssm", "client/recording"],
     ["client/dssmctl"],
+    ["client/view"],
     ["daemon/base"],
     ["daemon/service"],
     ["daemon/streams"],
@@ -64,6 +65,15 @@ ONLY = {
         "core/base/unique_fd.hpp",
         "core/clock/lockstep_page.hpp",
         "core/wire/host_id.hpp",
+    ],
+    # dssm-view: the public headers, what dssmctl shows, and how recordings describe streams.
+    "client/view": [
+        "core/include",
+        "client/include",
+        "client/dssmctl",
+        "client/recording/ros2_schema.hpp",
+        "client/recording/stream_channel.hpp",
+        "core/base/try.hpp",
     ],
 }
 INCLUDE_ROOTS = ["", "core/include", "client/include", "client/ssm/include"]

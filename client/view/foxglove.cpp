@@ -1,0 +1,291 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "client/view/foxglove.hpp"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <array>
+#include <cstring>
+#include <utility>
+
+#include "client/dssmctl/nodes.hpp"
+#include "client/dssmctl/output.hpp"
+#include "client/recording/ros2_schema.hpp"
+#include "client/recording/stream_channel.hpp"
+
+namespace dssm::view {
+namespace {
+
+using ctl::Json;
+
+// What may wait for one client. A single sample may be larger.
+constexpr std::size_t kMaxWaitingBytes = 1U << 20;
+// Of one stream in one turn, so that no other waits long.
+constexpr int kMaxTurnSamples = 200;
+constexpr Duration kTimePeriod = std::chrono::milliseconds(50);
+constexpr Duration kLossReportPeriod = std::chrono::seconds(2);
+
+enum : unsigned char { kMessageData = 1, kTime = 2 };
+
+template <class Number>
+void put(std::vector<std::byte>& out, Number number) {
+  const auto bytes = std::as_bytes(std::span(&number, 1));
+  out.insert(out.end(), bytes.begin(), bytes.end());
+}
+
+// A sample as CDR, as a recording has it but without the trailer.
+void put_sample(std::vector<std::byte>& out, const TypeInfo& type,
+                std::span<const std::byte> payload) {
+  put(out, recording::kCdrHead);
+  if (recording::is_sequence(type)) put(out, static_cast<std::uint32_t>(payload.size()));
+  const std::size_t begin = out.size();
+  out.insert(out.end(), payload.begin(), payload.end());
+  // One that is shorter than its type has zeros in its place.
+  if (!recording::is_sequence(type)) out.resize(begin + type.payload_bytes);
+}
+
+}  // namespace
+
+class FoxgloveConnection : public Connection {
+ public:
+  FoxgloveConnection(FoxgloveClients& clients, Peer& peer) : clients_(clients), peer_(peer) {
+    clients_.connections_.insert(this);
+    send({{"op", "serverInfo"},
+          {"name", fmt::format("dssm-view on {}", clients_.host_)},
+          {"capabilities", {"time", "connectionGraph"}},
+          {"supportedEncodings", Json::array()},
+          {"metadata", {{"host", clients_.host_}}},
+          {"sessionId", clients_.session_id_}});
+    advertise();
+  }
+  FoxgloveConnection(const FoxgloveConnection&) = delete;
+  FoxgloveConnection& operator=(const FoxgloveConnection&) = delete;
+  ~FoxgloveConnection() override { clients_.connections_.erase(this); }
+
+  void on_text(std::string_view text) override {
+    const Json request = Json::parse(text, nullptr, false);
+    const auto op = request.is_object() ? request.find("op") : request.end();
+    if (!request.is_object() || op == request.end() || !op->is_string()) {
+      return report(2, "a message is to be a JSON object with a text 'op'");
+    }
+    if (*op == "subscribe") return subscribe(request);
+    if (*op == "unsubscribe") return unsubscribe(request);
+    if (*op == "subscribeConnectionGraph") {
+      wants_graph_ = true;
+      return send_graph();
+    }
+    if (*op == "unsubscribeConnectionGraph") {
+      wants_graph_ = false;
+      return;
+    }
+    report(1, fmt::format("this server does not offer '{}'", op->get<std::string>()));
+  }
+
+  // Tells the client of channels that it does not know, and of those that are gone.
+  void advertise() {
+    Json gone = Json::array();
+    for (const std::uint32_t id : advertised_) {
+      if (!clients_.channels_.contains(id)) gone.push_back(id);
+    }
+    if (!gone.empty()) {
+      for (const Json& id : gone) {
+        advertised_.erase(id.get<std::uint32_t>());
+        std::erase_if(subscriptions_, [&](const auto& subscription) {
+          return subscription.second.channel == id.get<std::uint32_t>();
+        });
+      }
+      send({{"op", "unadvertise"}, {"channelIds", gone}});
+    }
+    std::string added;
+    for (const auto& [id, channel] : clients_.channels_) {
+      if (!advertised_.insert(id).second) continue;
+      if (!added.empty()) added += ',';
+      added += channel.advertisement;
+    }
+    if (!added.empty()) {
+      peer_.send(Message::text(fmt::format(R"({{"op":"advertise","channels":[{}]}})", added)));
+    }
+  }
+
+  void send_graph() {
+    if (wants_graph_ && !clients_.graph_.empty()) peer_.send(Message::text(clients_.graph_));
+  }
+
+  void send_samples(MonoTime now) {
+    for (auto& [id, subscription] : subscriptions_) send_samples(id, subscription);
+    if (now >= next_time_ && peer_.waiting_bytes() < kMaxWaitingBytes) {
+      next_time_ = now + kTimePeriod;
+      std::vector<std::byte> message;
+      put(message, kTime);
+      put(message, static_cast<std::uint64_t>(std::max(clients_.clock_.now_s(), 0.0) * 1e9));
+      peer_.send(Message::binary({message}));
+    }
+    if (left_out_ > 0 && now >= next_report_) {
+      next_report_ = now + kLossReportPeriod;
+      report(1, fmt::format("{} samples were left out: this client or the network to it is slower "
+                            "than the streams",
+                            std::exchange(left_out_, 0)));
+    }
+  }
+
+ private:
+  struct Subscription {
+    std::uint32_t channel = 0;
+    Tid next = kNoTid;  // kNoTid: from the newest on
+    std::uint64_t incarnation = 0;
+  };
+
+  void send(const Json& message) { peer_.send(Message::text(ctl::json_text(message))); }
+  // level: 0 info, 1 warning, 2 error
+  void report(int level, const std::string& text) {
+    if (peer_.waiting_bytes() >= kMaxWaitingBytes) return;
+    send({{"op", "status"}, {"level", level}, {"message", text}});
+  }
+
+  void subscribe(const Json& request) {
+    const auto list = request.find("subscriptions");
+    if (list == request.end() || !list->is_array()) return;
+    for (const Json& entry : *list) {
+      const auto number = [&](const char* key) -> std::optional<std::uint32_t> {
+        if (!entry.is_object() || !entry.contains(key) || !entry[key].is_number_unsigned()) {
+          return std::nullopt;
+        }
+        return entry[key].get<std::uint32_t>();
+      };
+      const auto id = number("id"), channel = number("channelId");
+      if (!id || !channel || !clients_.channels_.contains(*channel)) {
+        report(2, "a subscription names a channel that does not exist");
+      } else if (!subscriptions_.emplace(*id, Subscription{*channel, kNoTid, 0}).second) {
+        report(1, fmt::format("there is a subscription {} already", *id));
+      }
+    }
+  }
+
+  void unsubscribe(const Json& request) {
+    const auto list = request.find("subscriptionIds");
+    if (list == request.end() || !list->is_array()) return;
+    for (const Json& id : *list) {
+      if (id.is_number_unsigned()) subscriptions_.erase(id.get<std::uint32_t>());
+    }
+  }
+
+  void send_samples(std::uint32_t id, Subscription& subscription) {
+    const auto channel = clients_.channels_.find(subscription.channel);
+    if (channel == clients_.channels_.end()) return;
+    OpenStream* const stream = clients_.streams_.find(channel->second.stream).stream;
+    if (!stream) return;
+    RawReader& reader = stream->reader;
+    if (subscription.incarnation != reader.incarnation()) {
+      subscription.incarnation = reader.incarnation();
+      subscription.next = kNoTid;
+    }
+    // Its channel was made for another type; the next state brings a new channel.
+    if (reader.incarnation() != channel->second.incarnation) return;
+    const Tid newest = reader.newest_tid();
+    if (newest == kNoTid) return;
+    if (subscription.next == kNoTid) subscription.next = newest;
+    if (subscription.next < reader.oldest_tid()) {
+      left_out_ += static_cast<std::uint64_t>(reader.oldest_tid() - subscription.next);
+      subscription.next = reader.oldest_tid();
+    }
+    for (int i = 0; i < kMaxTurnSamples && subscription.next <= newest; ++i) {
+      if (peer_.waiting_bytes() >= kMaxWaitingBytes) {
+        left_out_ += static_cast<std::uint64_t>(newest + 1 - subscription.next);
+        subscription.next = newest + 1;
+        return;
+      }
+      BorrowedSample sample;
+      const ReadStatus status = reader.borrow(subscription.next, sample);
+      if (status == ReadStatus::restarted) return stream->follow_restart();
+      if (status == ReadStatus::arriving || status == ReadStatus::not_yet) return;
+      ++subscription.next;
+      if (status != ReadStatus::ok) continue;
+      std::vector<std::byte> message;
+      message.reserve(sample.payload().size() + 32);
+      put(message, kMessageData);
+      put(message, id);
+      put(message, recording::log_time_of(sample.info().time));
+      put_sample(message, channel->second.type, sample.payload());
+      if (sample.still_valid()) peer_.send(Message::binary({message}));
+    }
+  }
+
+  FoxgloveClients& clients_;
+  Peer& peer_;
+  std::set<std::uint32_t> advertised_;                   // channels
+  std::map<std::uint32_t, Subscription> subscriptions_;  // by the client's ids
+  bool wants_graph_ = false;
+  std::uint64_t left_out_ = 0;  // samples, since the last report
+  MonoTime next_time_{}, next_report_{};
+};
+
+FoxgloveClients::FoxgloveClients(Streams& streams, PlaybackClock clock)
+    : streams_(streams),
+      clock_(std::move(clock)),
+      session_id_(std::to_string(to_ns(WallClock::now()))) {}
+
+std::unique_ptr<Connection> FoxgloveClients::connect(Peer& peer) {
+  return std::make_unique<FoxgloveConnection>(*this, peer);
+}
+
+void FoxgloveClients::on_state(const VehicleState& state) {
+  host_ = state.host;
+  std::set<std::pair<std::string, std::uint64_t>> there;
+  for (const StreamInfo& stream : state.streams) {
+    const std::string name = stream.id.str();
+    there.emplace(name, stream.incarnation);
+    const auto known = std::ranges::find_if(channels_, [&](const auto& numbered) {
+      return numbered.second.stream == name && numbered.second.incarnation == stream.incarnation &&
+             numbered.second.type == stream.type;
+    });
+    if (known != channels_.end()) continue;
+    std::erase_if(channels_, [&](const auto& numbered) { return numbered.second.stream == name; });
+    const recording::Ros2Schema schema = recording::ros2_schema(stream.type);
+    const std::uint32_t id = ++last_channel_;
+    const Json advertisement = {{"id", id},
+                                {"topic", recording::topic_of(stream.id)},
+                                {"encoding", "cdr"},
+                                {"schemaName", schema.name},
+                                {"schema", schema.text},
+                                {"schemaEncoding", "ros2msg"}};
+    channels_[id] = {name, stream.incarnation, stream.type, ctl::json_text(advertisement)};
+  }
+  std::erase_if(channels_, [&](const auto& numbered) {
+    return !there.contains({numbered.second.stream, numbered.second.incarnation});
+  });
+
+  std::map<std::string, std::pair<Json, Json>> users;  // writers and readers of each topic
+  for (const NodeInfo& node : state.nodes) {
+    const std::string program = fmt::format("{}@{} ({})", node.program, node.host, node.pid);
+    for (const NodeStream& used : node.streams) {
+      auto& [writers, readers] = users[recording::topic_of(used.stream)];
+      (used.role == Role::writer ? writers : readers).push_back(program);
+    }
+  }
+  Json published = Json::array(), subscribed = Json::array();
+  for (const auto& [topic, programs] : users) {
+    const auto& [writers, readers] = programs;
+    if (!writers.empty()) published.push_back({{"name", topic}, {"publisherIds", writers}});
+    if (!readers.empty()) subscribed.push_back({{"name", topic}, {"subscriberIds", readers}});
+  }
+  // A whole graph each time it changes: clients replace what they know of each topic.
+  const std::string graph = ctl::json_text({{"op", "connectionGraphUpdate"},
+                                            {"publishedTopics", published},
+                                            {"subscribedTopics", subscribed},
+                                            {"advertisedServices", Json::array()},
+                                            {"removedTopics", Json::array()},
+                                            {"removedServices", Json::array()}});
+  const bool is_new_graph = graph != graph_;
+  graph_ = graph;
+  for (FoxgloveConnection* connection : connections_) {
+    connection->advertise();
+    if (is_new_graph) connection->send_graph();
+  }
+}
+
+void FoxgloveClients::send_samples() {
+  const MonoTime now = MonoClock::now();
+  for (FoxgloveConnection* connection : connections_) connection->send_samples(now);
+}
+
+}  // namespace dssm::view

@@ -1,0 +1,61 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Foxglove's WebSocket protocol, for Foxglove and other programs that speak it
+// (https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md): each stream is a channel, whose
+// samples are CDR with a ROS 2 schema, as in recordings (docs/recording.md).
+//
+// Samples are sent as they come. Of those that the other end does not take in time none waits here
+// beyond a budget: they are left out, and it is told how many.
+#pragma once
+
+#include <cstdint>
+#include <dssm/session.hpp>
+#include <map>
+#include <memory>
+#include <set>
+#include <string>
+#include <vector>
+
+#include "client/view/server.hpp"
+#include "client/view/state.hpp"
+#include "client/view/streams.hpp"
+
+namespace dssm::view {
+
+class FoxgloveConnection;
+
+// All clients. In the server's thread.
+class FoxgloveClients {
+ public:
+  // Both outlive it.
+  FoxgloveClients(Streams& streams, PlaybackClock clock);
+
+  std::unique_ptr<Connection> connect(Peer& peer);
+
+  // What there is now; called about once a second.
+  void on_state(const VehicleState& state);
+
+  // Sends the samples that have come since the last call; to be called each kSendPeriod.
+  void send_samples();
+  static constexpr Duration kSendPeriod = std::chrono::milliseconds(10);
+
+ private:
+  friend class FoxgloveConnection;
+  struct Channel {
+    std::string stream;
+    std::uint64_t incarnation = 0;
+    TypeInfo type;
+    std::string advertisement;  // JSON
+  };
+
+  Streams& streams_;
+  PlaybackClock clock_;
+  std::string host_;
+  std::map<std::uint32_t, Channel> channels_;  // by their ids
+  std::uint32_t last_channel_ = 0;
+  std::string graph_;  // the message about programs and streams
+  const std::string session_id_;
+  std::set<FoxgloveConnection*> connections_;
+};
+
+}  // namespace dssm::view

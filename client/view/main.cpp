@@ -1,0 +1,172 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// dssm-view: shows the streams of all hosts in a web browser, to Foxglove, and their figures to
+// Prometheus. It is a reader as any other: what it does, or a browser that hangs, delays nobody.
+//
+// Exit status: 0 ended by a signal, 1 failure, 2 wrong usage.
+#include <fmt/format.h>
+#include <signal.h>
+
+#include <CLI/CLI.hpp>
+#include <cstdio>
+#include <dssm/session.hpp>
+#include <string>
+#include <utility>
+
+#include "client/dssmctl/metrics.hpp"
+#include "client/dssmctl/text.hpp"
+#include "client/view/foxglove.hpp"
+#include "client/view/page.hpp"
+#include "client/view/server.hpp"
+#include "client/view/state.hpp"
+#include "client/view/streams.hpp"
+#include "client/view/worker.hpp"
+#include "core/base/try.hpp"
+
+namespace dssm::view {
+namespace {
+
+constexpr int kSuccess = 0;
+constexpr int kFailure = 1;
+constexpr int kWrongUsage = 2;
+
+constexpr Duration kClosePeriod = std::chrono::seconds(5);
+
+struct Options {
+  std::string listen = "127.0.0.1:8765";
+  std::string socket_path;
+  bool insecure = false;
+  ServerOptions server;
+};
+
+Server* running_server = nullptr;
+void on_stop_signal(int /*signal*/) { running_server->stop(); }
+
+Error wrong(std::string text) { return {Errc::invalid_argument, std::move(text)}; }
+
+// Address and port of "127.0.0.1:8765", "[::1]:8765".
+Result<void> split_listen(Options& options) {
+  const std::string& text = options.listen;
+  const std::size_t colon = text.rfind(':');
+  const Result<std::uint64_t> port = colon == std::string::npos
+                                         ? Result<std::uint64_t>(wrong(""))
+                                         : ctl::parse_whole(text.substr(colon + 1), 0, 65535);
+  std::string address = text.substr(0, colon);
+  if (address.size() > 2 && address.front() == '[' && address.back() == ']') {
+    address = address.substr(1, address.size() - 2);
+  }
+  if (!port || address.empty()) {
+    return wrong(
+        fmt::format("--listen '{}' is not ADDRESS:PORT, as 127.0.0.1:8765", ctl::escaped(text)));
+  }
+  options.server.address = address;
+  options.server.port = static_cast<std::uint16_t>(*port);
+  const bool is_loopback = address.starts_with("127.") || address == "::1";
+  if (!is_loopback && options.server.certificate.empty() && !options.insecure) {
+    return wrong(fmt::format(
+        "with --listen {} other PCs could read all streams: give --certificate, --key and "
+        "--authority, or --insecure if all who reach that address may read them",
+        ctl::escaped(text)));
+  }
+  return {};
+}
+
+Result<void> serve(Options options) {
+  DSSM_TRY(split_listen(options));
+  SessionOptions session_options;
+  session_options.socket_path = options.socket_path;
+  session_options.program = "dssm-view";
+  session_options.on_notice = [](const std::string&) {};
+  Session session = DSSM_TRY(Session::connect(session_options));
+  PlaybackClock clock = DSSM_TRY(session.open_playback_clock());
+
+  Server server(options.server);
+  Streams streams(session, server);
+  StateCollector collector(session, options.socket_path);
+  Pages pages(streams, collector);
+  FoxgloveClients foxglove(streams, std::move(clock));
+  Worker scrapes;
+
+  server.serve_websocket("dssm.view.v1", [&](Peer& peer) { return pages.connect(peer); });
+  for (const char* name : {"foxglove.sdk.v1", "foxglove.websocket.v1"}) {
+    server.serve_websocket(name, [&](Peer& peer) { return foxglove.connect(peer); });
+  }
+  server.serve_text("/metrics", "application/openmetrics-text; version=1.0.0; charset=utf-8",
+                    [&](const Server::Answer& answer) {
+                      scrapes.add([&, answer] { answer(ctl::metrics_text(session)); });
+                    });
+  server.repeat(FoxgloveClients::kSendPeriod, [&] { foxglove.send_samples(); });
+  server.repeat(kClosePeriod, [&] { streams.close_unused(); });
+  const std::uint16_t port = DSSM_TRY(server.listen());
+  collector.start([&](const VehicleState& state) {
+    server.post([&, state] {
+      foxglove.on_state(state);
+      pages.on_state(state.json);
+    });
+  });
+
+  running_server = &server;
+  struct sigaction action {};
+  action.sa_handler = on_stop_signal;
+  for (const int number : {SIGINT, SIGTERM, SIGHUP}) ::sigaction(number, &action, nullptr);
+  const std::string& address = options.server.address;
+  const std::string host = address.find(':') == std::string::npos ? address : "[" + address + "]";
+  std::puts(fmt::format("dssm-view: http{}://{}:{}/", options.server.certificate.empty() ? "" : "s",
+                        host, port)
+                .c_str());
+  std::fflush(stdout);
+  server.run();
+  return {};
+}
+
+int main_program(int argc, char** argv) {
+  Options options;
+  ServerOptions& server = options.server;
+  server.pages = DSSM_VIEW_PAGES;
+  CLI::App app(
+      "Shows the streams of all hosts in a web browser and to Foxglove, and their figures to "
+      "Prometheus (/metrics).",
+      "dssm-view");
+  app.set_version_flag("--version", DSSM_VERSION);
+  app.add_option("--listen", options.listen, "Where to listen")
+      ->type_name("ADDRESS:PORT")
+      ->capture_default_str();
+  app.add_option("--socket", options.socket_path,
+                 "dssmd's socket (default: $DSSM_SOCKET, else "
+                 "/run/dssm/dssmd.sock)")
+      ->type_name("PATH");
+  app.add_option("--certificate", server.certificate, "TLS: this server's certificate (PEM)")
+      ->type_name("FILE");
+  app.add_option("--key", server.key, "TLS: its private key (PEM)")->type_name("FILE");
+  app.add_option("--authority", server.authority,
+                 "TLS: clients must have a certificate of this CA (PEM)")
+      ->type_name("FILE");
+  app.add_flag("--insecure", options.insecure,
+               "Listen for other PCs without TLS: all who reach the address may read all streams");
+  app.add_option("--host", server.hosts, "A further name by which browsers may call this server")
+      ->type_name("NAME");
+  app.add_option("--origin", server.origins,
+                 "A server whose pages may connect, as https://app.foxglove.dev")
+      ->type_name("URL");
+  app.add_option("--pages", server.pages, "The folder with the page")->type_name("FOLDER");
+  try {
+    app.parse(argc, argv);
+  } catch (const CLI::ParseError& error) {
+    return app.exit(error) == 0 ? kSuccess : kWrongUsage;
+  }
+  if (server.certificate.empty() != server.key.empty()) {
+    std::fputs("dssm-view: --certificate and --key belong together\n", stderr);
+    return kWrongUsage;
+  }
+  const Result<void> served = serve(std::move(options));
+  if (served) return kSuccess;
+  std::fputs(fmt::format("dssm-view: {}\n", ctl::escaped_message(served.error().message)).c_str(),
+             stderr);
+  return served.error().code == Errc::invalid_argument ? kWrongUsage : kFailure;
+}
+
+}  // namespace
+}  // namespace dssm::view
+
+// NOLINTNEXTLINE(bugprone-exception-escape): what is thrown ends the program
+int main(int argc, char** argv) { return dssm::view::main_program(argc, argv); }

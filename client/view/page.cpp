@@ -1,0 +1,336 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "client/view/page.hpp"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <array>
+#include <charconv>
+#include <cstring>
+#include <limits>
+#include <optional>
+#include <utility>
+#include <vector>
+
+#include "client/dssmctl/describe.hpp"
+#include "client/dssmctl/fields.hpp"
+#include "client/view/curves.hpp"
+#include "core/base/try.hpp"
+
+namespace dssm::view {
+namespace {
+
+using ctl::Json;
+
+constexpr std::size_t kMaxUnanswered = 16;
+constexpr std::size_t kMaxStreams = 64;  // of one request
+constexpr std::size_t kMaxFields = 64;
+constexpr std::uint64_t kMaxPoints = 20'000;
+constexpr std::uint64_t kMaxPayloadBytes = 64U << 20;  // of one answer
+constexpr std::size_t kAlignment = 8;                  // of data in an answer
+
+Error wrong(std::string text) { return {Errc::invalid_argument, std::move(text)}; }
+
+// --- requests
+
+std::string text_of(const Json& request, const char* key) {
+  const auto found = request.find(key);
+  return found != request.end() && found->is_string() ? found->get<std::string>() : std::string();
+}
+
+// Nanoseconds as a string; empty: null, or nothing is there.
+Result<std::optional<Time>> time_of(const Json& request, const char* key) {
+  const auto found = request.find(key);
+  if (found == request.end() || found->is_null()) return std::optional<Time>();
+  const std::string text = text_of(request, key);
+  std::int64_t ns = 0;
+  const auto end = text.data() + text.size();
+  if (text.empty() || std::from_chars(text.data(), end, ns).ptr != end) {
+    return wrong(fmt::format("'{}' is to be a string of nanoseconds since 1970", key));
+  }
+  return std::optional(time_from_ns(ns));
+}
+
+Result<std::vector<std::string>> texts_of(const Json& request, const char* key, std::size_t most) {
+  const auto found = request.find(key);
+  std::vector<std::string> texts;
+  if (found == request.end() || !found->is_array() || found->size() > most) {
+    return wrong(fmt::format("'{}' is to be a list of at most {} strings", key, most));
+  }
+  for (const Json& text : *found) {
+    if (!text.is_string()) return wrong(fmt::format("'{}' is to have strings only", key));
+    texts.push_back(text.get<std::string>());
+  }
+  return texts;
+}
+
+// --- answers
+
+std::span<const std::byte> bytes_of(const std::vector<double>& numbers) {
+  return std::as_bytes(std::span(numbers));
+}
+
+// An answer with data. Its head names where they are.
+class DataAnswer {
+ public:
+  explicit DataAnswer(std::uint32_t id) : id_(id) {}
+
+  // Where the data will be; they are sent with send() and must live until then.
+  std::uint64_t add(std::span<const std::byte> data) {
+    const std::uint64_t at = bytes_;
+    parts_.push_back(data);
+    bytes_ = (at + data.size() + kAlignment - 1) / kAlignment * kAlignment;
+    return at;
+  }
+
+  Message message(const Json& head) const {
+    std::string text = ctl::json_text(head);
+    text.resize((text.size() + kAlignment - 1) / kAlignment * kAlignment, ' ');
+    const std::array<std::uint32_t, 2> lengths = {id_, static_cast<std::uint32_t>(text.size())};
+    std::vector<std::byte> data(bytes_);
+    std::size_t at = 0;
+    for (const auto part : parts_) {
+      if (!part.empty()) std::memcpy(data.data() + at, part.data(), part.size());
+      at += (part.size() + kAlignment - 1) / kAlignment * kAlignment;
+    }
+    return Message::binary(
+        {std::as_bytes(std::span(lengths)), std::as_bytes(std::span(text)), data});
+  }
+
+ private:
+  std::uint32_t id_;
+  std::uint64_t bytes_ = 0;
+  std::vector<std::span<const std::byte>> parts_;
+};
+
+// What a request gets of a stream that is not open.
+void add_missing(Json& json, const Streams::Found& found) {
+  json["status"] = found.error.empty() ? "opening" : "unavailable";
+  if (!found.error.empty()) json["error"] = found.error;
+}
+
+Json time_json(Time time) { return std::to_string(to_ns(time)); }
+
+Result<Message> type_answer(Streams& streams, std::uint32_t id, const Json& request) {
+  const Streams::Found found = streams.find(text_of(request, "stream"));
+  Json json = {{"id", id}, {"stream", text_of(request, "stream")}};
+  if (found.stream) {
+    const TypeInfo& type = found.stream->reader.type();
+    TypeInfo readable = type;
+    readable.fields = found.stream->fields;
+    json["status"] = "ok";
+    json["name"] = type.name;
+    json["payload_bytes"] = type.payload_bytes;
+    json["fields"] = ctl::fields_json(readable);
+  } else {
+    add_missing(json, found);
+  }
+  return Message::text(ctl::json_text(json));
+}
+
+Result<Message> signals_answer(Streams& streams, std::uint32_t id, const Json& request) {
+  const std::vector<std::string> names = DSSM_TRY(texts_of(request, "fields", kMaxFields));
+  const std::optional<Time> from = DSSM_TRY(time_of(request, "from_ns"));
+  const std::optional<Time> wanted_to = DSSM_TRY(time_of(request, "to_ns"));
+  const Time to = wanted_to.value_or(WallClock::now());
+  if (!from || *from >= to) return wrong("'from_ns' is to be before 'to_ns'");
+  const auto points = request.find("points");
+  if (points == request.end() || !points->is_number_unsigned() ||
+      points->get<std::uint64_t>() < 2 || points->get<std::uint64_t>() > kMaxPoints) {
+    return wrong(fmt::format("'points' is to be a number from 2 to {}", kMaxPoints));
+  }
+  DataAnswer answer(id);
+  Json head = {{"to_ns", time_json(to)}};
+  const Streams::Found found = streams.find(text_of(request, "stream"));
+  if (!found.stream) {
+    add_missing(head, found);
+    return answer.message(head);
+  }
+  OpenStream& stream = *found.stream;
+  std::vector<ctl::FieldElement> fields;
+  for (const std::string& name : names) {
+    const auto field = ctl::find_field(stream.fields, name);
+    if (!field) return wrong(fmt::format("the stream has no field '{}'", name));
+    fields.push_back(*field);
+  }
+  SignalRange range = read_signals(stream.reader, fields, *from, to, points->get<std::size_t>());
+  if (range.status == ReadStatus::restarted) {
+    stream.follow_restart();
+    range = {};
+    range.status = ReadStatus::restarted;
+  }
+  head["status"] = name_of(range.status);
+  head["samples"] = range.samples;
+  head["lost"] = range.lost;
+  head["clock_error_s"] = range.clock_error >= kForeignClockError
+                              ? Json()
+                              : Json(std::chrono::duration<double>(range.clock_error).count());
+  head["curves"] = Json::array();
+  for (std::size_t i = 0; i < range.curves.size(); ++i) {
+    const Curve& curve = range.curves[i];
+    head["curves"].push_back({{"field", names[i]},
+                              {"points", curve.values.size()},
+                              {"times_at", answer.add(bytes_of(curve.times_s))},
+                              {"values_at", answer.add(bytes_of(curve.values))},
+                              {"tids_at", answer.add(bytes_of(curve.tids))}});
+  }
+  return answer.message(head);
+}
+
+// A stream's part in an answer to "at".
+struct Part {
+  std::string name;
+  OpenStream* stream = nullptr;
+  std::string missing_error;  // why it is not open; empty: it is being opened
+  std::vector<std::byte> payload;
+  ReadStatus status = ReadStatus::not_yet;
+  SampleInfo info;
+};
+
+// Reads all of `parts` at `t` together. One that has no sample then is left out, with its status,
+// and the others are read again.
+void read_together(std::vector<Part*> parts, Time t) {
+  while (!parts.empty()) {
+    std::vector<JointSample> samples;
+    for (Part* part : parts) {
+      part->payload.resize(part->stream->reader.payload_bytes());
+      samples.push_back({&part->stream->reader, part->payload, {}});
+    }
+    const JointRead read = read_joint_at(t, samples);
+    if (read.status == ReadStatus::ok) {
+      for (std::size_t i = 0; i < parts.size(); ++i) {
+        parts[i]->status = read.status;
+        parts[i]->info = samples[i].info;
+      }
+      return;
+    }
+    Part* const failed = parts[read.index];
+    failed->status = read.status;
+    if (read.status == ReadStatus::restarted) failed->stream->follow_restart();
+    parts.erase(parts.begin() + static_cast<std::ptrdiff_t>(read.index));
+  }
+}
+
+void read_newest(Part& part) {
+  RawReader& reader = part.stream->reader;
+  part.payload.resize(reader.payload_bytes());
+  part.status = reader.read_newest(part.payload, part.info);
+  if (part.status == ReadStatus::restarted) part.stream->follow_restart();
+}
+
+Result<Message> at_answer(Streams& streams, std::uint32_t id, const Json& request) {
+  const std::vector<std::string> names = DSSM_TRY(texts_of(request, "streams", kMaxStreams));
+  const std::optional<Time> t = DSSM_TRY(time_of(request, "t_ns"));
+  std::vector<Part> parts;
+  std::uint64_t bytes = 0;
+  for (const std::string& name : names) {
+    const Streams::Found found = streams.find(name);
+    parts.push_back({name, found.stream, found.error, {}, ReadStatus::not_yet, {}});
+    if (found.stream) bytes += found.stream->reader.payload_bytes();
+  }
+  if (bytes > kMaxPayloadBytes) {
+    return wrong(
+        fmt::format("samples of these streams may have {} bytes together; at most {} are "
+                    "sent at once",
+                    bytes, kMaxPayloadBytes));
+  }
+  std::vector<Part*> open;
+  for (Part& part : parts) {
+    if (!part.stream) continue;
+    open.push_back(&part);
+    if (!t) read_newest(part);
+  }
+  if (t) read_together(open, *t);
+
+  DataAnswer answer(id);
+  Json head = {{"t_ns", t ? time_json(*t) : Json()}, {"samples", Json::array()}};
+  for (const Part& part : parts) {
+    Json json = {{"stream", part.name}};
+    if (!part.stream) {
+      add_missing(json, {nullptr, part.missing_error});
+    } else {
+      json["status"] = name_of(part.status);
+    }
+    if (part.stream && part.status == ReadStatus::ok) {
+      const Duration error = part.stream->reader.clock_error(part.info);
+      json["tid"] = part.info.tid;
+      json["time_ns"] = time_json(part.info.time);
+      json["clock_error_ns"] =
+          error >= kForeignClockError ? Json() : Json(std::to_string(to_ns(error)));
+      json["payload_at"] = answer.add(std::span(part.payload).first(part.info.payload_bytes));
+      json["payload_bytes"] = part.info.payload_bytes;
+    }
+    head["samples"].push_back(std::move(json));
+  }
+  return answer.message(head);
+}
+
+}  // namespace
+
+// --- a page
+
+class PageConnection : public Connection {
+ public:
+  PageConnection(Pages& pages, Peer& peer) : pages_(pages), peer_(peer) {
+    pages_.connections_.insert(this);
+  }
+  PageConnection(const PageConnection&) = delete;
+  PageConnection& operator=(const PageConnection&) = delete;
+  ~PageConnection() override { pages_.connections_.erase(this); }
+
+  void on_text(std::string_view text) override {
+    const Json request = Json::parse(text, nullptr, false);
+    const auto id = request.is_object() ? request.find("id") : request.end();
+    if (!request.is_object() || id == request.end() || !id->is_number_unsigned() ||
+        id->get<std::uint64_t>() > std::numeric_limits<std::uint32_t>::max()) {
+      return peer_.close("a request is to be a JSON object with a number 'id'");
+    }
+    if (peer_.waiting() + waiting_for_state_.size() >= kMaxUnanswered) {
+      return peer_.close("too many requests at once");
+    }
+    const auto number = id->get<std::uint32_t>();
+    const std::string op = text_of(request, "op");
+    if (op == "overview") {
+      waiting_for_state_.push_back(number);
+      pages_.collector_.want_all();
+      return send_state();
+    }
+    Result<Message> answer = op == "type"      ? type_answer(pages_.streams_, number, request)
+                             : op == "signals" ? signals_answer(pages_.streams_, number, request)
+                             : op == "at"      ? at_answer(pages_.streams_, number, request)
+                                          : wrong(fmt::format("there is no operation '{}'", op));
+    if (!answer) {
+      answer = Message::text(ctl::json_text({{"id", number}, {"error", answer.error().message}}));
+    }
+    peer_.send(*std::move(answer));
+  }
+
+  // Answers requests for a state that this page has not had.
+  void send_state() {
+    if (waiting_for_state_.empty() || state_number_ == pages_.state_number_) return;
+    state_number_ = pages_.state_number_;
+    for (const std::uint32_t id : std::exchange(waiting_for_state_, {})) {
+      Json answer = {{"id", id}};
+      answer.update(pages_.state_);
+      peer_.send(Message::text(ctl::json_text(answer)));
+    }
+  }
+
+ private:
+  Pages& pages_;
+  Peer& peer_;
+  std::vector<std::uint32_t> waiting_for_state_;
+  std::uint64_t state_number_ = 0;  // that it has
+};
+
+std::unique_ptr<Connection> Pages::connect(Peer& peer) {
+  return std::make_unique<PageConnection>(*this, peer);
+}
+
+void Pages::on_state(Json state) {
+  state_ = std::move(state);
+  ++state_number_;
+  for (PageConnection* connection : connections_) connection->send_state();
+}
+
+}  // namespace dssm::view

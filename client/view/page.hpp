@@ -1,0 +1,42 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The protocol between dssm-view and its page, "dssm.view.v1" (docs/view.md): the page asks, and
+// gets one answer for each request. So a browser that is slow, or does not read at all, delays
+// itself only.
+#pragma once
+
+#include <cstdint>
+#include <memory>
+#include <set>
+#include <string>
+
+#include "client/dssmctl/output.hpp"
+#include "client/view/server.hpp"
+#include "client/view/state.hpp"
+#include "client/view/streams.hpp"
+
+namespace dssm::view {
+
+class PageConnection;
+
+// All pages that are open. In the server's thread.
+class Pages {
+ public:
+  // Both outlive it.
+  Pages(Streams& streams, StateCollector& collector) : streams_(streams), collector_(collector) {}
+
+  std::unique_ptr<Connection> connect(Peer& peer);
+
+  // A new state, for the pages that wait for one.
+  void on_state(ctl::Json state);
+
+ private:
+  friend class PageConnection;
+  Streams& streams_;
+  StateCollector& collector_;
+  ctl::Json state_;
+  std::uint64_t state_number_ = 0;  // 0: there is none yet
+  std::set<PageConnection*> connections_;
+};
+
+}  // namespace dssm::view

@@ -1,0 +1,397 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "client/view/server.hpp"
+
+#include <arpa/inet.h>
+#include <fmt/format.h>
+#include <libwebsockets.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <array>
+#include <cerrno>
+#include <cstring>
+#include <utility>
+
+namespace dssm::view {
+namespace {
+
+constexpr std::size_t kMaxRequestBytes = 64U << 10;  // of a WebSocket's message to this server
+// Browsers ask each time whether a file has changed.
+constexpr int kRevalidate = 1;
+
+// The value of a request's header; empty: it has none.
+std::string header(lws* connection, lws_token_indexes which) {
+  const int length = lws_hdr_total_length(connection, which);
+  if (length <= 0) return {};
+  std::string value(static_cast<std::size_t>(length) + 1, '\0');
+  const int copied = lws_hdr_copy(connection, value.data(), length + 1, which);
+  value.resize(copied > 0 ? static_cast<std::size_t>(copied) : 0);
+  return value;
+}
+
+// "pc1:8765", "[::1]:8765" or "pc1" without the port.
+std::string_view without_port(std::string_view host) {
+  if (host.starts_with('[')) {
+    const std::size_t end = host.find(']');
+    return end == std::string_view::npos ? host : host.substr(1, end - 1);
+  }
+  return host.substr(0, host.find(':'));
+}
+
+bool is_address(const std::string& text) {
+  std::array<unsigned char, sizeof(in6_addr)> ignored{};
+  return ::inet_pton(AF_INET, text.c_str(), ignored.data()) == 1 ||
+         ::inet_pton(AF_INET6, text.c_str(), ignored.data()) == 1;
+}
+
+std::string this_pc() {
+  std::array<char, 256> name{};
+  return ::gethostname(name.data(), name.size() - 1) == 0 ? name.data() : "";
+}
+
+}  // namespace
+
+// --- messages and peers
+
+Message::Message(std::size_t bytes, bool is_text)
+    : buffer_(std::make_shared<std::vector<unsigned char>>(LWS_PRE + bytes)), is_text_(is_text) {}
+
+Message Message::text(std::string_view text) {
+  Message message(text.size(), true);
+  std::ranges::copy(text, message.buffer_->data() + LWS_PRE);
+  return message;
+}
+
+Message Message::binary(std::initializer_list<std::span<const std::byte>> parts) {
+  std::size_t bytes = 0;
+  for (const auto part : parts) bytes += part.size();
+  Message message(bytes, false);
+  unsigned char* to = message.buffer_->data() + LWS_PRE;
+  for (const auto part : parts) {
+    if (!part.empty()) std::memcpy(to, part.data(), part.size());
+    to += part.size();
+  }
+  return message;
+}
+
+std::size_t Message::bytes() const { return buffer_->size() - LWS_PRE; }
+
+void Peer::send(Message message) {
+  if (is_closing_) return;
+  waiting_bytes_ += message.bytes();
+  waiting_.push_back(std::move(message));
+  lws_callback_on_writable(connection_);
+}
+
+void Peer::close(std::string_view reason) {
+  if (std::exchange(is_closing_, true)) return;
+  waiting_.clear();
+  waiting_bytes_ = 0;
+  std::string text(reason);
+  lws_close_reason(connection_, LWS_CLOSE_STATUS_POLICY_VIOLATION,
+                   reinterpret_cast<unsigned char*>(text.data()), text.size());
+  lws_callback_on_writable(connection_);
+}
+
+// --- the server
+
+struct Server::Library {
+  std::vector<lws_protocols> protocols;
+  std::string pages, address, certificate, key, authority;
+  lws_http_mount files{};
+  std::vector<lws_http_mount> texts;
+  std::array<lws_protocol_vhost_options, 5> headers{};
+};
+
+struct Server::Timer {
+  lws_sorted_usec_list_t entry{};  // the first: libwebsockets gives its address to run()
+  Server* server = nullptr;
+  Duration period{};
+  std::function<void()> call;
+
+  void schedule() {
+    lws_sul_schedule(server->context_, 0, &entry, &Timer::run,
+                     std::chrono::duration_cast<std::chrono::microseconds>(period).count());
+  }
+  static void run(lws_sorted_usec_list_t* entry) {
+    auto& timer = *reinterpret_cast<Timer*>(entry);
+    timer.call();
+    timer.schedule();
+  }
+};
+
+struct Server::WebSocket {
+  Peer peer;
+  std::unique_ptr<Connection> connection;
+  std::string received;  // of a message that is not complete
+};
+
+Server::Server(ServerOptions options)
+    : options_(std::move(options)), library_(std::make_unique<Library>()) {}
+
+Server::~Server() {
+  for (const auto& timer : timers_) lws_sul_cancel(&timer->entry);
+  if (context_) lws_context_destroy(context_);
+}
+
+Result<std::uint16_t> Server::listen() {
+  lws_set_log_level(LLL_ERR, [](int, const char* line) {
+    std::fputs(fmt::format("dssm-view: {}", line).c_str(), stderr);
+  });
+  Library& library = *library_;
+  library.pages = options_.pages.string();
+  library.address = options_.address;
+  library.files.mountpoint = "/";
+  library.files.mountpoint_len = 1;
+  library.files.origin = library.pages.c_str();
+  library.files.origin_protocol = LWSMPRO_FILE;
+  library.files.def = "index.html";
+  library.files.cache_revalidate = kRevalidate;
+
+  // Also against what the page itself may be made to do by a name that it shows.
+  auto add_header = [&, n = 0U](const char* name, const char* value) mutable {
+    library.headers[n] = {n > 0 ? &library.headers[n - 1] : nullptr, nullptr, name, value};
+    ++n;
+  };
+  add_header("content-security-policy:",
+             "default-src 'none'; script-src 'self'; style-src 'self'; "
+             "img-src 'self' blob: data:; connect-src 'self' ws: wss:; "
+             "frame-ancestors 'none'; base-uri 'none'; form-action 'none'");
+  add_header("x-content-type-options:", "nosniff");
+  add_header("x-frame-options:", "deny");
+  add_header("referrer-policy:", "no-referrer");
+  add_header("cross-origin-resource-policy:", "same-origin");
+
+  const auto callback = [](lws* connection, lws_callback_reasons reason, void* user, void* in,
+                           std::size_t length) {
+    return Server::on_event(connection, reason, user, in, length);
+  };
+  library.protocols.push_back({"http", callback, sizeof(std::uint64_t), 0, 0, nullptr, 0});
+  for (const auto& [name, connect] : endpoints_) {
+    library.protocols.push_back({name.c_str(), callback, sizeof(WebSocket*), 4096, 0, nullptr, 0});
+  }
+  library.protocols.push_back({});
+
+  lws_context_creation_info info{};
+  info.port = options_.port;
+  info.iface = library.address.c_str();
+  info.protocols = library.protocols.data();
+  info.mounts = &library.files;
+  info.headers = &library.headers.back();
+  info.user = this;
+  info.options = LWS_SERVER_OPTION_FAIL_UPON_UNABLE_TO_BIND | LWS_SERVER_OPTION_VALIDATE_UTF8;
+  info.keepalive_timeout = 60;
+  if (!options_.certificate.empty()) {
+    library.certificate = options_.certificate.string();
+    library.key = options_.key.string();
+    info.options |= LWS_SERVER_OPTION_DO_SSL_GLOBAL_INIT;
+    info.ssl_cert_filepath = library.certificate.c_str();
+    info.ssl_private_key_filepath = library.key.c_str();
+    if (!options_.authority.empty()) {
+      library.authority = options_.authority.string();
+      info.ssl_ca_filepath = library.authority.c_str();
+      info.options |= LWS_SERVER_OPTION_REQUIRE_VALID_OPENSSL_CLIENT_CERT;
+    }
+  }
+  context_ = lws_create_context(&info);
+  if (!context_) {
+    return Error{Errc::system,
+                 fmt::format("listen on {}:{}: {}; is another dssm-view running, or is that not an "
+                             "address of this PC?",
+                             options_.address, options_.port, std::strerror(errno))};
+  }
+  for (const auto& timer : timers_) timer->schedule();
+  return static_cast<std::uint16_t>(
+      lws_get_vhost_listen_port(lws_get_vhost_by_name(context_, "default")));
+}
+
+void Server::serve_text(const std::string& path, std::string content_type,
+                        std::function<void(Answer)> make) {
+  texts_[path] = {std::move(content_type), std::move(make)};
+}
+
+void Server::repeat(Duration period, std::function<void()> call) {
+  timers_.push_back(std::make_unique<Timer>());
+  Timer& timer = *timers_.back();
+  timer.server = this;
+  timer.period = period;
+  timer.call = std::move(call);
+}
+
+void Server::post(std::function<void()> call) {
+  {
+    const std::lock_guard lock(mutex_);
+    posted_.push_back(std::move(call));
+  }
+  if (context_) lws_cancel_service(context_);
+}
+
+void Server::call_posted() {
+  std::vector<std::function<void()>> calls;
+  {
+    const std::lock_guard lock(mutex_);
+    calls.swap(posted_);
+  }
+  for (const auto& call : calls) call();
+}
+
+void Server::run() {
+  while (!is_stopped_ && lws_service(context_, 0) >= 0) {
+  }
+}
+
+void Server::stop() noexcept {
+  is_stopped_ = true;
+  lws_cancel_service(context_);
+}
+
+std::string Server::refusal(lws* connection) const {
+  const std::string host = header(connection, WSI_TOKEN_HOST);
+  const std::string name(without_port(host));
+  const std::string own = this_pc();
+  if (!is_address(name) && name != "localhost" && name != own && name != own + ".local" &&
+      std::ranges::find(options_.hosts, name) == options_.hosts.end()) {
+    return fmt::format("this PC is not known as '{}'; --host allows the name", name);
+  }
+  const std::string origin = header(connection, WSI_TOKEN_ORIGIN);
+  const std::string_view scheme = options_.certificate.empty() ? "http" : "https";
+  if (!origin.empty() && origin != fmt::format("{}://{}", scheme, host) &&
+      std::ranges::find(options_.origins, origin) == options_.origins.end()) {
+    return fmt::format("pages of '{}' may not connect; --origin allows them", origin);
+  }
+  return {};
+}
+
+int Server::on_event(lws* connection, int reason, void* user, void* in, std::size_t length) {
+  auto& server = *static_cast<Server*>(lws_context_user(lws_get_context(connection)));
+  const lws_protocols* protocol = lws_get_protocol(connection);
+  if (reason == LWS_CALLBACK_EVENT_WAIT_CANCELLED) {  // comes once for each protocol
+    if (protocol == lws_vhost_name_to_protocol(lws_get_vhost(connection), "http")) {
+      server.call_posted();
+    }
+    return 0;
+  }
+  if (reason == LWS_CALLBACK_FILTER_HTTP_CONNECTION ||
+      reason == LWS_CALLBACK_FILTER_PROTOCOL_CONNECTION) {
+    const std::string text = server.refusal(connection);
+    if (text.empty()) return 0;
+    lws_return_http_status(connection, HTTP_STATUS_FORBIDDEN, text.c_str());
+    return -1;
+  }
+  if (!user || !protocol) return 0;
+  const bool is_http = std::strcmp(protocol->name, "http") == 0;
+  const bool goes_on =
+      is_http
+          ? server.on_http(connection, reason, *static_cast<std::uint64_t*>(user), in)
+          : server.on_websocket(connection, reason, *static_cast<WebSocket**>(user), in, length);
+  return goes_on ? 0 : -1;
+}
+
+// --- texts
+
+bool Server::on_http(lws* connection, int reason, std::uint64_t& request, void* in) {
+  switch (reason) {
+    case LWS_CALLBACK_HTTP:
+      return begin_text(connection, request, static_cast<const char*>(in));
+    case LWS_CALLBACK_HTTP_WRITEABLE: {
+      const auto found = requests_.find(request);
+      if (found == requests_.end()) return true;
+      const bool goes_on = write_text(connection, found->second);
+      requests_.erase(found);
+      return goes_on;
+    }
+    case LWS_CALLBACK_CLOSED_HTTP:
+      requests_.erase(request);
+      return true;
+    default:
+      return true;
+  }
+}
+
+bool Server::begin_text(lws* connection, std::uint64_t& request, const std::string& path) {
+  const auto text = texts_.find(path);
+  if (text == texts_.end()) {
+    lws_return_http_status(connection, HTTP_STATUS_NOT_FOUND, nullptr);
+    return lws_http_transaction_completed(connection) == 0;
+  }
+  request = ++last_request_;
+  requests_.emplace(request, Request{connection, text->second.content_type});
+  text->second.make([this, number = request](Result<std::string> made) {
+    post([this, number, made = std::move(made)]() mutable {
+      const auto found = requests_.find(number);
+      if (found == requests_.end()) return;  // the client has gone
+      found->second.text = std::move(made);
+      lws_callback_on_writable(found->second.connection);
+    });
+  });
+  return true;
+}
+
+bool Server::write_text(lws* connection, Request& request) {
+  const bool is_made = request.text.has_value();
+  const std::string& text = is_made ? *request.text : request.text.error().message;
+  std::array<unsigned char, LWS_PRE + 2048> head{};
+  unsigned char* at = head.data() + LWS_PRE;
+  unsigned char* const end = head.data() + head.size() - 1;
+  if (lws_add_http_common_headers(
+          connection, is_made ? HTTP_STATUS_OK : HTTP_STATUS_SERVICE_UNAVAILABLE,
+          is_made ? request.content_type.c_str() : "text/plain; charset=utf-8", text.size(), &at,
+          end) != 0 ||
+      lws_finalize_write_http_header(connection, head.data() + LWS_PRE, &at, end) != 0) {
+    return false;
+  }
+  Message body = Message::text(text);
+  const int written =
+      lws_write(connection, body.buffer_->data() + LWS_PRE, body.bytes(), LWS_WRITE_HTTP_FINAL);
+  if (written < static_cast<int>(body.bytes())) return false;
+  return lws_http_transaction_completed(connection) == 0;
+}
+
+// --- WebSockets
+
+bool Server::on_websocket(lws* connection, int reason, WebSocket*& socket, void* in,
+                          std::size_t length) {
+  if (reason == LWS_CALLBACK_ESTABLISHED) {
+    socket = new WebSocket{Peer(connection), nullptr, {}};
+    socket->connection = endpoints_.at(lws_get_protocol(connection)->name)(socket->peer);
+    return true;
+  }
+  if (!socket) return true;
+  switch (reason) {
+    case LWS_CALLBACK_CLOSED:
+      delete std::exchange(socket, nullptr);
+      return true;
+    case LWS_CALLBACK_RECEIVE:
+      if (socket->peer.is_closing_) return true;
+      socket->received.append(static_cast<const char*>(in), length);
+      if (socket->received.size() > kMaxRequestBytes) {
+        socket->peer.close("a message is larger than 64 KiB");
+      } else if (lws_is_final_fragment(connection) &&
+                 lws_remaining_packet_payload(connection) == 0) {
+        const std::string text = std::exchange(socket->received, {});
+        if (!lws_frame_is_binary(connection)) socket->connection->on_text(text);
+      }
+      return true;
+    case LWS_CALLBACK_SERVER_WRITEABLE:
+      return write_message(*socket);
+    default:
+      return true;
+  }
+}
+
+bool Server::write_message(WebSocket& socket) {
+  Peer& peer = socket.peer;
+  if (peer.is_closing_) return false;
+  if (peer.waiting_.empty()) return true;
+  const Message message = std::move(peer.waiting_.front());
+  peer.waiting_.pop_front();
+  peer.waiting_bytes_ -= message.bytes();
+  const int written =
+      lws_write(peer.connection_, message.buffer_->data() + LWS_PRE, message.bytes(),
+                message.is_text_ ? LWS_WRITE_TEXT : LWS_WRITE_BINARY);
+  if (written < static_cast<int>(message.bytes())) return false;
+  if (!peer.waiting_.empty()) lws_callback_on_writable(peer.connection_);
+  return true;
+}
+
+}  // namespace dssm::view

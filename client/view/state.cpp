@@ -1,0 +1,185 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "client/view/state.hpp"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+
+#include "client/dssmctl/describe.hpp"
+#include "client/dssmctl/doctor.hpp"
+#include "client/dssmctl/nodes.hpp"
+#include "client/dssmctl/text.hpp"
+#include "core/base/try.hpp"
+
+namespace dssm::view {
+namespace {
+
+using ctl::Json;
+
+Json time_json(Time time) { return std::to_string(to_ns(time)); }
+
+bool is_up(HostState state) { return state == HostState::up || state == HostState::self; }
+
+// The time of the oldest sample that the stream's ring holds, about: by its rate.
+std::optional<Time> oldest_time(const StreamInfo& stream) {
+  if (stream.newest == kNoTid) return std::nullopt;
+  const double cycle_s =
+      stream.rate_hz > 0 ? 1 / stream.rate_hz : std::chrono::duration<double>(stream.cycle).count();
+  const double length_s = static_cast<double>(stream.newest - stream.oldest) * cycle_s;
+  return ctl::saturating_add(stream.newest_time,
+                             -Duration(static_cast<std::int64_t>(length_s * 1e9)));
+}
+
+Json streams_json(const std::vector<StreamInfo>& streams, Json& range) {
+  std::optional<Time> first, last;
+  Json list = Json::array();
+  for (const StreamInfo& stream : streams) {
+    const std::optional<Time> oldest = oldest_time(stream);
+    Json json = ctl::stream_json(stream);
+    json["oldest_ns"] = oldest ? time_json(*oldest) : Json();
+    json["newest_ns"] = oldest ? time_json(stream.newest_time) : Json();
+    list.push_back(std::move(json));
+    if (!oldest) continue;
+    first = std::min(first.value_or(*oldest), *oldest);
+    last = std::max(last.value_or(stream.newest_time), stream.newest_time);
+  }
+  range = first ? Json{{"oldest_ns", time_json(*first)}, {"newest_ns", time_json(*last)}} : Json();
+  return list;
+}
+
+}  // namespace
+
+void StateCollector::start(std::function<void(const VehicleState&)> on_state) {
+  on_state_ = std::move(on_state);
+  thread_ = std::thread([this] { run(); });
+}
+
+StateCollector::~StateCollector() {
+  {
+    const std::lock_guard lock(mutex_);
+    is_ending_ = true;
+  }
+  changed_.notify_one();
+  if (thread_.joinable()) thread_.join();
+}
+
+void StateCollector::want_all() {
+  {
+    const std::lock_guard lock(mutex_);
+    const MonoTime now = MonoClock::now();
+    if (now < wanted_until_ - kWantedTime + kPeriod) return;
+    is_wanted_now_ = now >= wanted_until_;
+    wanted_until_ = now + kWantedTime;
+  }
+  changed_.notify_one();
+}
+
+void StateCollector::run() {
+  std::unique_lock lock(mutex_);
+  while (!is_ending_) {
+    const bool all = MonoClock::now() < wanted_until_;
+    is_wanted_now_ = false;
+    lock.unlock();
+    const MonoTime next = deadline_in(kPeriod);
+    const Result<void> collected = collect(all);
+    if (bool(collected) != is_connected_) {
+      is_connected_ = bool(collected);
+      add_event(!is_connected_, is_connected_ ? "dssmd answers again" : collected.error().message);
+    }
+    state_.json["now_ns"] = time_json(WallClock::now());
+    state_.json["error"] = collected ? "" : collected.error().message;
+    state_.json["events"] = events_;
+    on_state_(state_);
+    lock.lock();
+    changed_.wait_until(lock, next, [&] { return is_ending_ || is_wanted_now_; });
+  }
+}
+
+Result<void> StateCollector::collect(bool all) {
+  const DaemonInfo daemon = DSSM_TRY(session_.daemon_info());
+  const std::vector<HostInfo> hosts = DSSM_TRY(session_.list_hosts());
+  state_.host = daemon.host;
+  state_.streams = DSSM_TRY(session_.list_streams());
+  find_events(hosts);
+  Json& json = state_.json;
+  json["host"] = daemon.host;
+  json["version"] = daemon.version;
+  json["recording"] = Json();
+  json["streams"] = streams_json(state_.streams, json["range"]);
+  json["hosts"] = Json::array();
+  for (const HostInfo& host : hosts) json["hosts"].push_back(ctl::host_json(host));
+  if (!all) return {};
+  state_.nodes = DSSM_TRY(session_.list_nodes());
+  json["nodes"] = Json::array();
+  for (const NodeInfo& node : state_.nodes) json["nodes"].push_back(ctl::node_json(node));
+  if (MonoClock::now() < next_findings_) return {};
+  next_findings_ = deadline_in(kFindingsPeriod);
+  ctl::CommonOptions options;
+  options.socket_path = socket_path_;
+  options.verb_name = "doctor";
+  json["findings"] = ctl::findings_json(ctl::findings_of(ctl::collect_facts(options)));
+  return {};
+}
+
+void StateCollector::find_events(const std::vector<HostInfo>& hosts) {
+  const bool is_first = !std::exchange(has_state_, true);
+  std::map<std::string, std::pair<HostState, bool>> new_hosts;
+  for (const HostInfo& host : hosts) {
+    if (host.name.empty() || host.reason == HostReason::spare_address) continue;
+    new_hosts[host.name] = {host.state, host.clock_refused};
+    if (is_first) continue;
+    const auto known = hosts_.find(host.name);
+    const bool was_up = known != hosts_.end() && is_up(known->second.first);
+    if (is_up(host.state) != was_up) {
+      add_event(was_up, was_up ? fmt::format("host {} is down: {}", host.name,
+                                             host.error.empty() ? "no answer" : host.error)
+                               : fmt::format("host {} is up", host.name));
+    }
+    const bool was_refused = known != hosts_.end() && known->second.second;
+    if (host.clock_refused != was_refused && is_up(host.state)) {
+      add_event(
+          host.clock_refused,
+          host.clock_refused
+              ? fmt::format("the clock of {} is out of bounds: {}", host.name, host.clock_reason)
+              : fmt::format("the clock of {} is within its bounds again", host.name));
+    }
+  }
+  for (const auto& [name, state] : hosts_) {
+    if (is_up(state.first) && !new_hosts.contains(name)) {
+      add_event(true, fmt::format("host {} is down: it is not known any more", name));
+    }
+  }
+  hosts_ = std::move(new_hosts);
+
+  std::map<std::string, StreamState> new_streams;
+  for (const StreamInfo& stream : state_.streams) {
+    const std::string name = stream.id.str();
+    new_streams[name] = stream.state;
+    if (is_first) continue;
+    const auto known = streams_.find(name);
+    if (known == streams_.end()) {
+      add_event(false, fmt::format("stream {} was created", name));
+      continue;
+    }
+    if (ctl::is_silent(stream) && known->second == StreamState::live) {
+      add_event(true, fmt::format("stream {}: {}", name, name_of(stream.state)));
+    } else if (stream.state == StreamState::live &&
+               (known->second == StreamState::stalled || known->second == StreamState::no_writer)) {
+      add_event(false, fmt::format("stream {} is live again", name));
+    }
+  }
+  for (const auto& [name, state] : streams_) {
+    if (!new_streams.contains(name)) add_event(false, fmt::format("stream {} is gone", name));
+  }
+  streams_ = std::move(new_streams);
+}
+
+void StateCollector::add_event(bool is_warning, std::string text) {
+  events_.push_back({{"number", ++last_event_},
+                     {"time_ns", time_json(WallClock::now())},
+                     {"severity", is_warning ? "warn" : "info"},
+                     {"text", std::move(text)}});
+  if (events_.size() > kMaxEvents) events_.pop_front();
+}
+
+}  // namespace dssm::view

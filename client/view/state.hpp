@@ -1,0 +1,79 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The state of the vehicle, as dssmd knows it, collected once a second by a thread of its own:
+// hosts and streams always, because from their changes follow the events; programs and doctor's
+// findings only while somebody looks.
+#pragma once
+
+#include <condition_variable>
+#include <cstdint>
+#include <deque>
+#include <dssm/session.hpp>
+#include <functional>
+#include <map>
+#include <mutex>
+#include <optional>
+#include <string>
+#include <thread>
+#include <utility>
+#include <vector>
+
+#include "client/dssmctl/output.hpp"
+
+namespace dssm::view {
+
+struct VehicleState {
+  std::string host;
+  std::vector<StreamInfo> streams;
+  std::vector<NodeInfo> nodes;
+  ctl::Json json;  // an answer to "overview" of the page's protocol (docs/view.md), without its id
+};
+
+class StateCollector {
+ public:
+  StateCollector(Session session, std::string socket_path)
+      : session_(std::move(session)), socket_path_(std::move(socket_path)) {}
+  StateCollector(const StateCollector&) = delete;
+  StateCollector& operator=(const StateCollector&) = delete;
+  ~StateCollector();
+
+  // From now on the thread calls `on_state` with each state. Once.
+  void start(std::function<void(const VehicleState&)> on_state);
+
+  // Somebody looks: all is collected, now if it was not for more than a second. Any thread.
+  void want_all();
+
+ private:
+  static constexpr Duration kPeriod = std::chrono::seconds(1);
+  static constexpr Duration kWantedTime = std::chrono::seconds(5);
+  static constexpr Duration kFindingsPeriod = std::chrono::seconds(10);
+  static constexpr std::size_t kMaxEvents = 200;
+
+  void run();
+  Result<void> collect(bool all);
+  void find_events(const std::vector<HostInfo>& hosts);
+  void add_event(bool is_warning, std::string text);
+
+  Session session_;
+  const std::string socket_path_;
+  std::function<void(const VehicleState&)> on_state_;
+
+  // The thread's.
+  VehicleState state_;
+  MonoTime next_findings_{};
+  bool has_state_ = false;
+  bool is_connected_ = true;
+  std::map<std::string, std::pair<HostState, bool>> hosts_;  // and whether its clock is refused
+  std::map<std::string, StreamState> streams_;
+  std::deque<ctl::Json> events_;
+  std::uint64_t last_event_ = 0;
+
+  std::mutex mutex_;
+  std::condition_variable changed_;
+  MonoTime wanted_until_{};
+  bool is_wanted_now_ = false;
+  bool is_ending_ = false;
+  std::thread thread_;
+};
+
+}  // namespace dssm::view

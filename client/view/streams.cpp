@@ -1,0 +1,62 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "client/view/streams.hpp"
+
+#include <memory>
+#include <utility>
+
+#include "client/dssmctl/fields.hpp"
+
+namespace dssm::view {
+
+OpenStream::OpenStream(RawReader opened)
+    : reader(std::move(opened)),
+      fields(ctl::readable_fields_untrusted(reader.type())),
+      restarts(reader.restarts()) {}
+
+void OpenStream::follow_restart() {
+  fields = ctl::readable_fields_untrusted(reader.type());
+  restarts = reader.restarts();
+}
+
+Streams::Found Streams::find(const std::string& name) {
+  Entry& entry = entries_[name];
+  const MonoTime now = MonoClock::now();
+  entry.used = now;
+  if (entry.stream && entry.stream->reader.restart_error()) {  // it cannot go on
+    entry.error = entry.stream->reader.restart_error()->message;
+    entry.stream.reset();
+  }
+  if (entry.stream) return {&*entry.stream, {}};
+  if (!entry.is_opening && now >= entry.retry_at) open(name);
+  return {nullptr, entry.error};
+}
+
+void Streams::open(const std::string& name) {
+  Entry& entry = entries_[name];
+  entry.is_opening = true;
+  entry.retry_at = deadline_in(kRetryPeriod);
+  const auto result = std::make_shared<Result<RawReader>>(Error{Errc::unavailable, {}});
+  worker_.add([this, name, result] {
+    const Result<StreamId> id = StreamId::parse(name);
+    *result = id ? session_.open_raw_reader(*id) : Result<RawReader>(id.error());
+    server_.post([this, name, result] {
+      Entry& opened = entries_[name];
+      opened.is_opening = false;
+      if (*result) {
+        opened.error.clear();
+        opened.stream.emplace(*std::move(*result));
+      } else {
+        opened.error = result->error().message;
+      }
+    });
+  });
+}
+
+void Streams::close_unused() {
+  const MonoTime now = MonoClock::now();
+  std::erase_if(entries_, [&](const auto& named) {
+    return !named.second.is_opening && now - named.second.used > kUnusedTime;
+  });
+}
+
+}  // namespace dssm::view

@@ -1,0 +1,67 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The streams that browsers look at: each is open once, however many look at it, and closed when
+// none did for half a minute. All calls come from the server's thread; opening, which may wait for
+// dssmd or for another host, is done by a worker.
+#pragma once
+
+#include <cstdint>
+#include <dssm/session.hpp>
+#include <map>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "client/view/server.hpp"
+#include "client/view/worker.hpp"
+
+namespace dssm::view {
+
+// A stream that is open.
+struct OpenStream {
+  explicit OpenStream(RawReader opened);
+
+  // To be called when a read returned `restarted`: type and fields may be others now.
+  void follow_restart();
+
+  RawReader reader;
+  std::vector<Field> fields;  // readable ones; empty: its payload is not described
+  std::uint64_t restarts = 0;
+};
+
+class Streams {
+ public:
+  // `server` outlives it.
+  Streams(Session session, Server& server) : session_(std::move(session)), server_(server) {}
+
+  // The stream of that full name, or nullptr: it is being opened, or could not be. That is tried
+  // again with each call, once a second at most.
+  struct Found {
+    OpenStream* stream = nullptr;  // until close_unused()
+    std::string error;             // empty: it is being opened
+  };
+  Found find(const std::string& name);
+
+  // Closes what was not found for long.
+  void close_unused();
+
+ private:
+  static constexpr Duration kUnusedTime = std::chrono::seconds(30);
+  static constexpr Duration kRetryPeriod = std::chrono::seconds(1);
+
+  struct Entry {
+    std::optional<OpenStream> stream;
+    std::string error;
+    bool is_opening = false;
+    MonoTime retry_at{};
+    MonoTime used{};
+  };
+  void open(const std::string& name);
+
+  Session session_;
+  Server& server_;
+  std::map<std::string, Entry> entries_;
+  Worker worker_;
+};
+
+}  // namespace dssm::view
