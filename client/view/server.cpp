@@ -313,6 +313,8 @@ bool Server::on_http(lws* connection, int reason, std::uint64_t& request, void* 
       requests_.erase(found);
       return goes_on;
     }
+    case LWS_CALLBACK_HTTP_FILE_COMPLETION:  // the connection's next request may be read
+      return lws_http_transaction_completed(connection) == 0;
     case LWS_CALLBACK_CLOSED_HTTP:
       requests_.erase(request);
       return true;

@@ -1,0 +1,174 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The graph of programs and streams as SVG, in layers: an arrow goes from a writer to its stream and
+// from there to each reader, dashed where the two are on different hosts. In a narrow window the
+// layers are below each other.
+
+const kSvg = "http://www.w3.org/2000/svg";
+const kBoxWidth = 148;
+const kBoxHeight = 40;
+const kLayerGap = 64; // between layers, where the arrows are
+const kGap = 14; // within a layer
+const kMargin = 6;
+const kSweeps = 8;
+const kNarrow = 560;
+const kMaxText = 20;
+
+// nodes: of `overview`; width: the place for the drawing, in CSS pixels.
+export function drawGraph(streams, nodes, width) {
+  const boxes = boxesOf(streams, nodes);
+  const layers = order(layersOf(boxes), boxes);
+  const down = width < kNarrow;
+  const size = place(layers, down);
+  const svg = make("svg", {
+    viewBox: `0 0 ${size.width} ${size.height}`, width: size.width, height: size.height,
+    role: "img", "aria-label": describe(boxes),
+  });
+  const defs = make("defs", {});
+  const head = make("marker", { id: "arrow", viewBox: "0 0 8 8", refX: 7, refY: 4, markerWidth: 7,
+    markerHeight: 7, orient: "auto-start-reverse" });
+  head.append(make("path", { d: "M0 0.5 L7.5 4 L0 7.5 z", class: "arrow-head" }));
+  defs.append(head);
+  svg.append(defs);
+  for (const box of boxes.values()) {
+    for (const to of box.to) svg.append(drawArrow(box, boxes.get(to), down));
+  }
+  for (const box of boxes.values()) svg.append(drawBox(box));
+  return svg;
+}
+
+// key -> {kind, title, host, level, to: keys, from: keys}
+function boxesOf(streams, nodes) {
+  const boxes = new Map();
+  const add = (key, kind, title, host, level) => {
+    if (!boxes.has(key)) boxes.set(key, { key, kind, title, host, level, to: new Set(), from: new Set() });
+    return boxes.get(key);
+  };
+  for (const stream of streams) {
+    const title = stream.id === 0 ? stream.name : `${stream.name}:${stream.id}`;
+    add(`stream ${stream.id_text}`, "stream", title, stream.host, stream.state ?? "unknown");
+  }
+  const link = (from, to) => {
+    from.to.add(to.key);
+    to.from.add(from.key);
+  };
+  for (const node of nodes) {
+    const key = `program ${node.host} ${node.pid} ${node.program}`;
+    const program = add(key, "program", node.program ?? `pid ${node.pid}`, node.host, "");
+    const streamOf = (use) => {
+      const [, name, host] = /^(.*?)(?:@(.*))?$/.exec(use.stream);
+      return add(`stream ${use.stream}`, "stream", name.replace(/:0$/, ""), host ?? node.host, "unknown");
+    };
+    for (const use of node.writes ?? []) link(program, streamOf(use));
+    for (const use of node.reads ?? []) link(streamOf(use), program);
+  }
+  return boxes;
+}
+
+// The longest way from a box without arrows to it; arrows that close a circle do not count.
+function layersOf(boxes) {
+  const layerOf = new Map();
+  const open = new Set();
+  const visit = (key) => {
+    if (layerOf.has(key)) return layerOf.get(key);
+    open.add(key);
+    let layer = boxes.get(key).kind === "stream" && boxes.get(key).from.size === 0 ? 1 : 0;
+    for (const from of boxes.get(key).from) {
+      if (!open.has(from)) layer = Math.max(layer, visit(from) + 1);
+    }
+    open.delete(key);
+    layerOf.set(key, layer);
+    return layer;
+  };
+  const layers = [];
+  for (const key of boxes.keys()) (layers[visit(key)] ??= []).push(key);
+  return layers.filter((layer) => layer);
+}
+
+// Fewer crossings: each box goes to the mean place of its neighbours, again and again.
+function order(layers, boxes) {
+  const at = new Map();
+  const note = (layer) => layer.forEach((key, i) => at.set(key, (i + 0.5) / layer.length));
+  layers.forEach(note);
+  for (let sweep = 0; sweep < kSweeps; ++sweep) {
+    const direction = sweep % 2 === 0 ? "from" : "to";
+    for (const layer of sweep % 2 === 0 ? layers : [...layers].reverse()) {
+      const mean = (key) => {
+        const next = [...boxes.get(key)[direction]];
+        if (next.length === 0) return at.get(key);
+        return next.reduce((total, other) => total + at.get(other), 0) / next.length;
+      };
+      const means = new Map(layer.map((key) => [key, mean(key)]));
+      layer.sort((a, b) => means.get(a) - means.get(b) || (a < b ? -1 : 1));
+      note(layer);
+    }
+  }
+  return layers.map((layer) => layer.map((key) => boxes.get(key)));
+}
+
+// Sets x and y of each box, centred in its layer; returns the size of the whole.
+function place(layers, down) {
+  const across = down ? kBoxWidth : kBoxHeight;
+  const along = down ? kBoxHeight : kBoxWidth;
+  const gap = down ? kLayerGap / 2 : kLayerGap;
+  const breadth = (layer) => layer.length * (across + kGap) - kGap;
+  const most = Math.max(0, ...layers.map(breadth));
+  layers.forEach((layer, i) => {
+    const start = kMargin + (most - breadth(layer)) / 2;
+    layer.forEach((box, j) => {
+      const u = kMargin + i * (along + gap);
+      const v = start + j * (across + kGap);
+      [box.x, box.y] = down ? [v, u] : [u, v];
+    });
+  });
+  const length = Math.max(0, layers.length * (along + gap) - gap) + 2 * kMargin;
+  return down ? { width: most + 2 * kMargin, height: length }
+    : { width: length, height: most + 2 * kMargin };
+}
+
+function drawArrow(from, to, down) {
+  const start = down ? [from.x + kBoxWidth / 2, from.y + kBoxHeight]
+    : [from.x + kBoxWidth, from.y + kBoxHeight / 2];
+  const end = down ? [to.x + kBoxWidth / 2, to.y] : [to.x, to.y + kBoxHeight / 2];
+  const bend = (down ? kLayerGap / 2 : kLayerGap) * 0.6;
+  const c1 = down ? [start[0], start[1] + bend] : [start[0] + bend, start[1]];
+  const c2 = down ? [end[0], end[1] - bend] : [end[0] - bend, end[1]];
+  const remote = from.host !== to.host;
+  return make("path", {
+    d: `M${start} C${c1} ${c2} ${end}`, class: remote ? "edge remote" : "edge",
+    "marker-end": "url(#arrow)", "data-from": from.key, "data-to": to.key,
+  });
+}
+
+function drawBox(box) {
+  const group = make("g", { class: `box ${box.kind}`, "data-level": box.level, "data-key": box.key });
+  const full = make("title", {});
+  full.textContent = `${box.kind} ${box.title} on ${box.host}${box.level ? `, ${box.level}` : ""}`;
+  const middle = box.x + kBoxWidth / 2;
+  const title = make("text", { x: middle, y: box.y + 17, class: "title" });
+  title.textContent = shortened(box.title);
+  const host = make("text", { x: middle, y: box.y + 31, class: "at" });
+  const state = box.level && box.level !== "live" && box.level !== "unknown" ? `, ${box.level}` : "";
+  host.textContent = `@${shortened(box.host)}${state}`;
+  group.append(full, make("rect", { x: box.x, y: box.y, width: kBoxWidth, height: kBoxHeight,
+    rx: box.kind === "stream" ? kBoxHeight / 2 : 3 }), title, host);
+  return group;
+}
+
+function shortened(text) {
+  return text.length > kMaxText ? `${text.slice(0, kMaxText - 1)}\u2026` : text;
+}
+
+function describe(boxes) {
+  const lines = [];
+  for (const box of boxes.values()) {
+    for (const to of box.to) lines.push(`${box.title} to ${boxes.get(to).title}`);
+  }
+  return `Arrows: ${lines.join(", ") || "none"}`;
+}
+
+function make(tag, attributes) {
+  const made = document.createElementNS(kSvg, tag);
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  return made;
+}

@@ -1,0 +1,399 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The page of dssm-view. This file connects its parts: the connection, the shown instant, the three
+// pages, the keys, and the state in the URL's fragment.
+import { Connection, LostError, Pump, RequestError } from "./connection.js";
+import { setText, timeOfDay } from "./format.js";
+import { Overview } from "./overview.js";
+import { Signals } from "./signals.js";
+import { Time, TimeBar } from "./time.js";
+import { Views } from "./views.js";
+
+const kOverviewMs = 1000;
+const kAtMs = 50;
+const kOpeningMs = 100;
+const kArrivingMs = 200; // the sample of a held instant is still on its way
+const kUrlMs = 300;
+const kTypeRetryMs = 2000;
+const kStepMs = 100; // where no stream is shown
+const kMaxSteps = 12; // requests for one step
+
+const find = (id) => document.getElementById(id);
+const scheme = location.protocol === "https:" ? "wss" : "ws";
+const connection = new Connection(`${scheme}://${location.host}/`);
+const time = new Time();
+let overview = null; // the last answer
+
+// --- types of streams -------------------------------------------------------------------------------
+
+// The types that were asked for. A recreated stream may have another one.
+class Types {
+  constructor() {
+    this.known = new Map(); // stream -> {type, incarnation, failedAt, promise}
+  }
+
+  get(stream) {
+    return this.known.get(stream)?.type ?? null;
+  }
+
+  // Null when it cannot be had.
+  ask(stream) {
+    const entry = this.known.get(stream);
+    if (entry && (entry.type || performance.now() - entry.failedAt < kTypeRetryMs)) return entry.promise;
+    const made = { type: null, failedAt: Infinity, incarnation: incarnationOf(stream) };
+    this.known.set(stream, made);
+    made.promise = connection.request("type", { stream }).then(
+      (answer) => (made.type = { fields: answer.fields ?? [], payload_bytes: answer.payload_bytes, name: answer.name }),
+      (error) => {
+        if (!(error instanceof RequestError || error instanceof LostError)) throw error;
+        made.failedAt = error instanceof LostError ? -Infinity : performance.now();
+        return null;
+      });
+    return made.promise;
+  }
+
+  forgetRecreated() {
+    for (const [stream, { incarnation }] of this.known) {
+      const now = incarnationOf(stream);
+      if (now !== null && now !== incarnation) this.known.delete(stream);
+    }
+  }
+}
+
+function incarnationOf(stream) {
+  return streams().find((one) => one.id_text === stream)?.incarnation ?? null;
+}
+
+function streams() {
+  return overview?.streams ?? [];
+}
+
+// --- the pages --------------------------------------------------------------------------------------
+
+const types = new Types();
+const parts = { connection, time, types, streams };
+const signals = new Signals(find("signals"), parts);
+const views = new Views(find("views"), parts);
+const overviewPage = new Overview(find("overview"), (stream) => {
+  if (!views.chosenStreams().includes(stream)) views.add({ stream });
+  views.changed();
+  showTab("views");
+});
+new TimeBar(find("time"), time, step);
+
+const kTabs = ["overview", "signals", "views"];
+let tab = "overview";
+
+function showTab(name) {
+  tab = name;
+  for (const one of kTabs) {
+    find(one).hidden = one !== name;
+    const button = find(`tab-${one}`);
+    button.setAttribute("aria-selected", String(one === name));
+    button.tabIndex = one === name ? 0 : -1;
+  }
+  find("time").hidden = name === "overview";
+  time.hover = null;
+  if (name === "overview") overviewPage.drawGraph();
+  else page().open();
+  atPump.wake();
+  writeUrl();
+}
+
+// The page that shows samples; null on the overview.
+function page() {
+  return { signals, views }[tab] ?? null;
+}
+
+const tabs = kTabs.map((name) => find(`tab-${name}`));
+for (const [i, button] of tabs.entries()) {
+  button.addEventListener("click", () => showTab(kTabs[i]));
+  button.addEventListener("keydown", (event) => {
+    const by = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+    if (!by) return;
+    event.stopPropagation();
+    const next = (i + by + tabs.length) % tabs.length;
+    tabs[next].focus();
+    showTab(kTabs[next]);
+  });
+}
+
+// --- requests ---------------------------------------------------------------------------------------
+
+const overviewPump = new Pump(connection, kOverviewMs, async () => {
+  const first = overview === null;
+  overview = await connection.request("overview");
+  time.setNow(BigInt(overview.now_ns));
+  const range = overview.range && { oldest: BigInt(overview.range.oldest_ns), newest: BigInt(overview.range.newest_ns) };
+  time.setRange(range, overview.recording !== null);
+  types.forgetRecreated();
+  setText(find("host"), overview.recording ? overview.recording.file : overview.host);
+  find("host").title = `dssm-view ${overview.version}`;
+  document.title = `${overview.recording ? overview.recording.file : overview.host} \u2013 DSSM view`;
+  overviewPage.show(overview);
+  views.showStreams();
+  if (page() && (first || !page().suggested)) page().open();
+  showBanner();
+  return 0;
+});
+
+// The samples of all that is visible, at one instant, with one request.
+const atPump = new Pump(connection, kAtMs, async () => {
+  const shown = page();
+  const wanted = shown?.chosenStreams() ?? [];
+  if (wanted.length === 0) return null;
+  const t = time.instant();
+  let answer;
+  try {
+    answer = await connection.request("at", { streams: wanted, t_ns: t === null ? null : String(t), payloads: true });
+  } catch (error) {
+    if (!(error instanceof RequestError)) throw error;
+    shown.showSamples(t ?? time.now(), new Map(wanted.map((stream) => [stream, failed(error.message)])));
+    return kOverviewMs;
+  }
+  const at = BigInt(answer.head.t_ns);
+  const samples = new Map(answer.head.samples.map((one) => [one.stream, sampleOf(one, answer)]));
+  if (shown === page()) {
+    shown.showSamples(at, samples);
+    time.setShown(at);
+  }
+  const has = (status) => answer.head.samples.some((one) => one.status === status);
+  if (has("opening")) return kOpeningMs;
+  if (time.mode !== "hold" && time.hover === null) return 0;
+  return has("arriving") || has("not yet") ? kArrivingMs : null;
+});
+time.addEventListener("change", () => atPump.wake());
+
+function sampleOf(one, answer) {
+  const has = one.payload_at !== undefined && one.payload_at !== null;
+  return {
+    status: one.status,
+    error: one.error ?? "",
+    tid: one.tid ?? null,
+    timeNs: one.time_ns === undefined || one.time_ns === null ? null : BigInt(one.time_ns),
+    clockErrorNs: one.clock_error_ns === undefined || one.clock_error_ns === null ? null : BigInt(one.clock_error_ns),
+    payload: has ? answer.bytes(one.payload_at, one.payload_bytes) : null,
+  };
+}
+
+function failed(error) {
+  return { status: "failed", error, tid: null, timeNs: null, clockErrorNs: null, payload: null };
+}
+
+// --- steps by samples -------------------------------------------------------------------------------
+
+// Moves the shown instant by `count` samples of the first stream shown, or of the view in focus.
+async function step(count) {
+  time.hover = null;
+  const stream = views.root.hidden ? signals.chosenStreams()[0] : views.stepStream();
+  const start = time.t ?? time.shown ?? time.now();
+  if (stepping) return;
+  stepping = true;
+  time.hold(start);
+  try {
+    for (let i = 0; i < Math.abs(count); ++i) {
+      const t = stream ? await neighbour(stream, time.t, Math.sign(count)) : null;
+      if (t === null) break;
+      time.hold(t);
+    }
+    if (!stream) time.hold(start + BigInt(count * kStepMs) * 1000000n);
+  } catch (error) {
+    if (!(error instanceof LostError || error instanceof RequestError)) throw error;
+  } finally {
+    stepping = false;
+  }
+}
+let stepping = false;
+
+// The time of the sample before or after the one at `t`; null for none.
+async function neighbour(stream, t, direction) {
+  const at = async (ns) => {
+    const answer = await connection.request("at", { streams: [stream], t_ns: String(ns), payloads: false });
+    const [sample] = answer.head.samples;
+    return sample.status === "ok" ? { tid: sample.tid, ns: BigInt(sample.time_ns) } : null;
+  };
+  const here = await at(t);
+  if (!here) return null;
+  if (direction < 0) return (await at(here.ns - 1n))?.ns ?? null;
+  // Ahead by a cycle, then by more; and back, should that skip samples.
+  const cycle = streams().find((one) => one.id_text === stream)?.cycle_ns;
+  let ahead = cycle > 0 ? BigInt(cycle) : 10000000n;
+  let next = null;
+  for (let i = 0; i < kMaxSteps && !next; ++i, ahead *= 2n) {
+    if (time.range && here.ns + ahead > time.range.newest + ahead) break;
+    const sample = await at(here.ns + ahead);
+    if (!sample) return null;
+    if (sample.tid !== here.tid) next = sample;
+  }
+  for (let i = 0; next && next.tid > here.tid + 1 && i < kMaxSteps; ++i) {
+    const before = await at(next.ns - 1n);
+    if (!before || before.tid <= here.tid) break;
+    next = before;
+  }
+  return next?.ns ?? null;
+}
+
+// --- the connection ---------------------------------------------------------------------------------
+
+let lostAt = null;
+connection.addEventListener("change", () => {
+  const { state } = connection;
+  if (state === "lost") lostAt ??= new Date();
+  else lostAt = null;
+  const status = find("connection");
+  status.dataset.state = state;
+  setText(status, state);
+  document.body.dataset.connection = state;
+  showBanner();
+});
+
+function showBanner() {
+  const banner = find("banner");
+  let text = "";
+  if (lostAt) {
+    const since = timeOfDay(BigInt(lostAt.getTime()) * 1000000n, 0);
+    text = `No connection to dssm-view at ${location.host} since ${since}. The page tries to reconnect each second.`;
+  } else if (overview?.error) {
+    text = `dssmd cannot be asked: ${overview.error}. The lists are the last known ones.`;
+  }
+  banner.hidden = text === "";
+  setText(banner, text);
+}
+
+// --- the URL's fragment -----------------------------------------------------------------------------
+
+let urlTimer = null;
+let chosen = { signals: false, views: false }; // whether a person chose them, or a link
+
+function writeUrl() {
+  clearTimeout(urlTimer);
+  urlTimer = setTimeout(() => {
+    const state = new URLSearchParams({ tab });
+    if (chosen.signals) state.set("signals", JSON.stringify(signals.state));
+    if (chosen.views) state.set("views", JSON.stringify(views.state));
+    if (time.mode === "hold" && time.t !== null) state.set("t", String(time.t));
+    history.replaceState(null, "", `#${state}`);
+  }, kUrlMs);
+}
+
+function parsed(text) {
+  try {
+    return JSON.parse(text);
+  } catch {
+    return null; // a link that was cut off
+  }
+}
+
+function readUrl() {
+  const state = new URLSearchParams(location.hash.slice(1));
+  const signalsState = parsed(state.get("signals"));
+  if (signalsState) {
+    chosen.signals = signals.suggested = true;
+    signals.state = signalsState;
+  }
+  const viewsState = parsed(state.get("views"));
+  if (viewsState) {
+    chosen.views = views.suggested = true;
+    views.state = viewsState;
+  }
+  const t = state.get("t");
+  if (t && /^\d{1,19}$/.test(t)) time.hold(BigInt(t));
+  showTab(kTabs.includes(state.get("tab")) ? state.get("tab") : "overview");
+}
+
+signals.addEventListener("change", () => {
+  chosen.signals = true;
+  writeUrl();
+});
+views.addEventListener("change", () => {
+  chosen.views = true;
+  writeUrl();
+});
+for (const event of ["mode", "change"]) {
+  time.addEventListener(event, () => (time.mode === "hold" || event === "mode") && time.hover === null && writeUrl());
+}
+window.addEventListener("hashchange", readUrl);
+
+// --- dark and light ---------------------------------------------------------------------------------
+
+const kThemeKey = "dssm-view-theme";
+const prefersDark = matchMedia("(prefers-color-scheme: dark)");
+
+function storedTheme() {
+  try {
+    return localStorage.getItem(kThemeKey);
+  } catch {
+    return null; // storage is off in this browser
+  }
+}
+
+function showTheme(theme) {
+  const dark = theme ? theme === "dark" : prefersDark.matches;
+  document.documentElement.dataset.theme = dark ? "dark" : "light";
+  setText(find("theme"), dark ? "Light" : "Dark");
+  signals.restyle();
+  views.restyle();
+}
+
+function toggleTheme() {
+  const theme = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
+  try {
+    localStorage.setItem(kThemeKey, theme);
+  } catch {
+    // It lasts until the page is closed.
+  }
+  showTheme(theme);
+}
+
+find("theme").addEventListener("click", toggleTheme);
+prefersDark.addEventListener("change", () => showTheme(storedTheme()));
+
+// --- keys and dialogs -------------------------------------------------------------------------------
+
+function toggleKeys() {
+  const dialog = find("keys");
+  if (dialog.open) dialog.close();
+  else dialog.showModal();
+}
+
+const kKeys = {
+  1: () => showTab("overview"),
+  2: () => showTab("signals"),
+  3: () => showTab("views"),
+  " ": () => time.toggle(),
+  ArrowLeft: (event) => step(event.shiftKey ? -10 : -1),
+  ArrowRight: (event) => step(event.shiftKey ? 10 : 1),
+  Home: () => time.range && time.hold(time.range.oldest),
+  End: () => time.live(),
+  l: () => time.live(),
+  p: () => tab === "signals" && signals.addPanel([], true),
+  z: () => signals.resetZoom(),
+  d: toggleTheme,
+  "?": toggleKeys,
+};
+const kOfTime = new Set([" ", "ArrowLeft", "ArrowRight", "Home", "End", "l"]);
+
+document.addEventListener("keydown", (event) => {
+  if (event.ctrlKey || event.metaKey || event.altKey) return;
+  const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+  const action = Object.hasOwn(kKeys, key) ? kKeys[key] : null;
+  if (!action) return;
+  const { target } = event;
+  const isSlider = target.id === "slider";
+  if (!isSlider && target.matches("input, select, textarea")) return;
+  if (key === " " && target.matches("button, summary, a")) return;
+  if (document.querySelector("dialog[open]") && key !== "?") return;
+  if (kOfTime.has(key) && !page()) return;
+  event.preventDefault();
+  action(event);
+});
+
+for (const dialog of document.querySelectorAll("dialog")) {
+  dialog.querySelector(".close").addEventListener("click", () => dialog.close());
+  dialog.addEventListener("click", (event) => event.target === dialog && dialog.close());
+}
+find("show-keys").addEventListener("click", toggleKeys);
+
+showTheme(storedTheme());
+readUrl();
+overviewPump.wake();
