@@ -47,7 +47,7 @@ export function duration(ns) {
   const size = Math.abs(Number(ns));
   const sign = Number(ns) < 0 ? "\u2212" : "";
   const text = (value, unit) => `${sign}${digits(value)} ${unit}`;
-  if (size < 1e3) return text(size, "ns");
+  if (size < 1e3) return `${sign}${size.toFixed(0)} ns`;
   if (size < 1e6) return text(size / 1e3, "\u00b5s");
   if (size < 1e9) return text(size / 1e6, "ms");
   if (size < 120e9) return text(size / 1e9, "s");

@@ -42,7 +42,7 @@ class Types {
     if (entry && (entry.type || performance.now() - entry.failedAt < kTypeRetryMs)) return entry.promise;
     const made = { type: null, failedAt: Infinity, incarnation: incarnationOf(stream) };
     this.known.set(stream, made);
-    made.promise = connection.request("type", { stream }).then(
+    made.promise = this.request(stream).then(
       (answer) => (made.type = { fields: answer.fields ?? [], payload_bytes: answer.payload_bytes, name: answer.name }),
       (error) => {
         if (!(error instanceof RequestError || error instanceof LostError)) throw error;
@@ -50,6 +50,14 @@ class Types {
         return null;
       });
     return made.promise;
+  }
+
+  async request(stream) {
+    for (;;) {
+      const answer = await connection.request("type", { stream });
+      if (answer.status !== "opening") return answer;
+      await new Promise((resolve) => setTimeout(resolve, kOpeningMs));
+    }
   }
 
   forgetRecreated() {
@@ -122,7 +130,7 @@ for (const [i, button] of tabs.entries()) {
 
 const overviewPump = new Pump(connection, kOverviewMs, async () => {
   const first = overview === null;
-  overview = await connection.request("overview");
+  overview = complete(await connection.request("overview"));
   time.setNow(BigInt(overview.now_ns));
   const range = overview.range && { oldest: BigInt(overview.range.oldest_ns), newest: BigInt(overview.range.newest_ns) };
   time.setRange(range, overview.recording !== null);
@@ -136,6 +144,15 @@ const overviewPump = new Pump(connection, kOverviewMs, async () => {
   showBanner();
   return 0;
 });
+
+// The first answer may come before all is known.
+function complete(answer) {
+  for (const list of ["hosts", "streams", "nodes", "findings", "events"]) answer[list] ??= [];
+  for (const stream of answer.streams) stream.id_text ??= stream.stream;
+  answer.range ??= null;
+  answer.recording ??= null;
+  return answer;
+}
 
 // The samples of all that is visible, at one instant, with one request.
 const atPump = new Pump(connection, kAtMs, async () => {
@@ -151,10 +168,11 @@ const atPump = new Pump(connection, kAtMs, async () => {
     shown.showSamples(t ?? time.now(), new Map(wanted.map((stream) => [stream, failed(error.message)])));
     return kOverviewMs;
   }
-  const at = BigInt(answer.head.t_ns);
+  const at = answer.head.t_ns ? BigInt(answer.head.t_ns) : t ?? time.now();
   const samples = new Map(answer.head.samples.map((one) => [one.stream, sampleOf(one, answer)]));
   if (shown === page()) {
     shown.showSamples(at, samples);
+    if (t === null) time.setNow(at);
     time.setShown(at);
   }
   const has = (status) => answer.head.samples.some((one) => one.status === status);

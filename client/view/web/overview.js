@@ -36,7 +36,7 @@ export class Overview {
 
   showHosts(hosts, limitNs) {
     setText(this.find("hosts-count"), String(hosts.length));
-    setText(this.find("clock-limit"), `limit ${duration(limitNs)}`);
+    setText(this.find("clock-limit"), `(limit ${duration(limitNs)})`);
     const key = (host) => host.host ?? host.id ?? host.addresses.join(" ");
     syncChildren(this.find("hosts").tBodies[0], hosts, key, makeHost, (row, host) => {
       const [name, state, trip, streams, bound, address, note] = row.cells;
@@ -111,7 +111,7 @@ export class Overview {
     syncChildren(this.find("findings"), bad, key, makeFinding, updateFinding);
     const details = this.find("findings-ok");
     details.hidden = good.length === 0;
-    setText(details.querySelector("summary"), `${good.length} checks found nothing`);
+    setText(details.querySelector("summary"), `${good.length} checks are ok`);
     syncChildren(details.querySelector("ul"), good, key, makeFinding, updateFinding);
   }
 

@@ -10,7 +10,7 @@ import { cssColor, download, duration, element, number, setText, timeOfDay } fro
 const kPeriodMs = 100;
 const kOpeningMs = 100;
 const kPoints = 800;
-const kExportPoints = 200000;
+const kExportPoints = 20000; // the most that is answered
 const kSpans = [1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1800, 3600]; // seconds
 const kDefaultSpan = 10;
 const kFewFields = 3; // shown before a person has chosen
@@ -90,7 +90,7 @@ export class Signals extends EventTarget {
 
   // Until a person has chosen: a panel with a few fields of each of the first streams.
   async suggest() {
-    if (this.panels.length > 0 || this.suggested) return;
+    if (this.panels.length > 0 || this.suggested || this.streams().length === 0) return;
     this.suggested = true;
     for (const stream of this.streams()) {
       const type = await this.types.ask(stream.id_text);
@@ -99,10 +99,7 @@ export class Signals extends EventTarget {
       this.addPanel(names.map((one) => ({ stream: stream.id_text, field: one.name })));
       if (this.panels.length === 2) break;
     }
-    if (this.panels.length === 0) {
-      this.suggested = false;
-      this.addPanel([]);
-    }
+    if (this.panels.length === 0) this.addPanel([]);
     this.wakeAll();
   }
 
@@ -272,6 +269,7 @@ export class Signals extends EventTarget {
   }
 
   tick(x, step) {
+    if (this.epoch === null) return "";
     const places = step >= 1 ? 0 : Math.min(9, Math.ceil(-Math.log10(step) - 1e-9));
     return timeOfDay(this.toTime(x), places);
   }
@@ -361,6 +359,7 @@ export class Signals extends EventTarget {
         count: head.samples ?? 0, clockErrorS: head.clock_error_s ?? null });
       if (head.from_ns) answer.from = BigInt(head.from_ns);
       if (head.to_ns) answer.to = BigInt(head.to_ns);
+      if (to === null) this.time.setNow(answer.to);
       for (const curve of head.curves ?? []) {
         answer.curves.set(curve.field, {
           times: binary.doubles(curve.times_at, curve.points),

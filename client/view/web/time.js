@@ -37,7 +37,11 @@ export class Time extends EventTarget {
     return this.nowNs + BigInt(Math.round((performance.now() - this.nowAt) * 1e6));
   }
 
+  // An answer can only be late, so the latest clock counts, unless the clock was set.
   setNow(ns) {
+    const kSetBackNs = 3000000000n;
+    const now = this.now();
+    if (ns < now && now - ns < kSetBackNs) return;
     this.nowNs = ns;
     this.nowAt = performance.now();
   }
@@ -173,8 +177,9 @@ export class TimeBar {
     const t = this.time.t ?? end;
     this.slider.value = String(t - oldest);
     this.slider.setAttribute("aria-valuetext", timeOfDay(t));
-    setText(this.oldest, `${duration(end - oldest)}`);
-    this.oldest.title = `The rings hold samples from ${timeOfDay(oldest)} to ${timeOfDay(newest)}`;
-    if (this.time.recording) this.oldest.title = "The length of the recording";
+    const length = duration(end - oldest);
+    setText(this.oldest, this.time.recording ? length : `\u2212${length}`);
+    this.oldest.title = this.time.recording ? "The length of the recording"
+      : `The rings hold samples from ${timeOfDay(oldest)} to ${timeOfDay(newest)}`;
   }
 }

@@ -211,7 +211,7 @@ class Card {
     this.drawing = null;
     if (!this.type) return;
     const guessed = guessKind(this.type);
-    this.kindBox.replaceChildren(new Option(`${kKinds[guessed]} (fits)`, ""),
+    this.kindBox.replaceChildren(new Option(`Auto: ${kKinds[guessed]}`, ""),
       ...this.possibleKinds().filter((kind) => kind !== guessed).map((kind) => new Option(kKinds[kind], kind)));
     if (this.kind === guessed) this.kind = null;
     this.kindBox.value = this.kind ?? "";
