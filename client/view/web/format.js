@@ -63,6 +63,12 @@ function digits(value) {
   return value.toFixed(2);
 }
 
+// For people to choose: 90 is "90 s", 120 is "2 min".
+export function wholeDuration(seconds) {
+  if (seconds % 3600 === 0) return `${seconds / 3600} h`;
+  return seconds % 60 === 0 ? `${seconds / 60} min` : `${seconds} s`;
+}
+
 export function bytes(count) {
   if (count < 1024) return `${count} B`;
   if (count < 1024 ** 2) return `${digits(count / 1024)} KiB`;

@@ -5,7 +5,7 @@
 // come with the page's one `at` request, so that they are those of the exact samples.
 import { Pump, RequestError } from "./connection.js";
 import { findField, isFloat, signalsOf, valueOf } from "./fields.js";
-import { cssColor, download, duration, element, number, setText, timeOfDay } from "./format.js";
+import { cssColor, download, duration, element, number, setText, timeOfDay, wholeDuration } from "./format.js";
 
 const kPeriodMs = 100;
 const kOpeningMs = 100;
@@ -53,7 +53,7 @@ export class Signals extends EventTarget {
   makeTools() {
     const find = (id) => this.root.querySelector(`#${id}`);
     this.spans = find("span");
-    for (const span of kSpans) this.spans.add(new Option(duration(span * 1e9), span));
+    for (const span of kSpans) this.spans.add(new Option(wholeDuration(span), span));
     this.spans.value = this.span;
     this.spans.addEventListener("change", () => {
       this.span = Number(this.spans.value);
@@ -191,7 +191,7 @@ export class Signals extends EventTarget {
     });
     const options = {
       ...this.plotSize(),
-      padding: [8, 12, 0, 0],
+      padding: [8, 30, 0, 0],
       legend: { show: false },
       scales: { x: { time: false, range: () => this.windowX() } },
       axes: [
@@ -401,7 +401,7 @@ export class Signals extends EventTarget {
       if (!answer) continue;
       if (answer.status !== "ok") notes.push(`${stream}: ${answer.error || answer.status}`);
       else if (answer.error) notes.push(answer.error);
-      else if (answer.count === 0) notes.push(`${stream}: no samples in this window`);
+      else if ([...answer.curves.values()].every((curve) => curve.times.length === 0)) notes.push(`${stream}: no samples in this window`);
       if (answer.lost > 0) notes.push(`${stream}: ${answer.lost} samples lost in this window`);
     }
     return notes.join("; ");

@@ -4,7 +4,7 @@
 // the kind of view that a person chose or that fits the type.
 import { Pump, RequestError } from "./connection.js";
 import { guessKind, imageOf, poseOf, scanOf } from "./fields.js";
-import { duration, element, setText, timeOfDay } from "./format.js";
+import { duration, element, setText, timeOfDay, wholeDuration } from "./format.js";
 import { HexView, ImageView, PlaneView, TableView } from "./drawings.js";
 
 const kSuggested = 6; // cards that are shown before a person has chosen
@@ -166,7 +166,7 @@ class Card {
       changed();
     } });
     for (const span of kTrailSpans) {
-      const text = span === 0 ? "none" : duration(span * 1e9);
+      const text = span === 0 ? "none" : wholeDuration(span);
       this.trailBox.add(new Option(text, span, span === this.trailS, span === this.trailS));
     }
     this.trailLabel = element("label", { hidden: true }, "trail ", this.trailBox);
