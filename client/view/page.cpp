@@ -14,6 +14,7 @@
 
 #include "client/dssmctl/describe.hpp"
 #include "client/dssmctl/fields.hpp"
+#include "client/dssmctl/text.hpp"
 #include "client/view/curves.hpp"
 #include "core/base/try.hpp"
 
@@ -29,7 +30,7 @@ constexpr std::uint64_t kMaxPoints = 20'000;
 constexpr std::uint64_t kMaxPayloadBytes = 64U << 20;  // of one answer
 constexpr std::size_t kAlignment = 8;                  // of data in an answer
 
-Error wrong(std::string text) { return {Errc::invalid_argument, std::move(text)}; }
+Error bad_request(std::string text) { return {Errc::invalid_argument, std::move(text)}; }
 
 // --- requests
 
@@ -46,7 +47,7 @@ Result<std::optional<Time>> time_of(const Json& request, const char* key) {
   std::int64_t ns = 0;
   const auto end = text.data() + text.size();
   if (text.empty() || std::from_chars(text.data(), end, ns).ptr != end) {
-    return wrong(fmt::format("'{}' is to be a string of nanoseconds since 1970", key));
+    return bad_request(fmt::format("'{}' is to be a string of nanoseconds since 1970", key));
   }
   return std::optional(time_from_ns(ns));
 }
@@ -55,10 +56,10 @@ Result<std::vector<std::string>> texts_of(const Json& request, const char* key, 
   const auto found = request.find(key);
   std::vector<std::string> texts;
   if (found == request.end() || !found->is_array() || found->size() > most) {
-    return wrong(fmt::format("'{}' is to be a list of at most {} strings", key, most));
+    return bad_request(fmt::format("'{}' is to be a list of at most {} strings", key, most));
   }
   for (const Json& text : *found) {
-    if (!text.is_string()) return wrong(fmt::format("'{}' is to have strings only", key));
+    if (!text.is_string()) return bad_request(fmt::format("'{}' is to have strings only", key));
     texts.push_back(text.get<std::string>());
   }
   return texts;
@@ -109,8 +110,6 @@ void add_missing(Json& json, const Streams::Found& found) {
   if (!found.error.empty()) json["error"] = found.error;
 }
 
-Json time_json(Time time) { return std::to_string(to_ns(time)); }
-
 Result<Message> type_answer(Streams& streams, std::uint32_t id, const Json& request) {
   const Streams::Found found = streams.find(text_of(request, "stream"));
   Json json = {{"id", id}, {"stream", text_of(request, "stream")}};
@@ -130,17 +129,22 @@ Result<Message> type_answer(Streams& streams, std::uint32_t id, const Json& requ
 
 Result<Message> signals_answer(Streams& streams, std::uint32_t id, const Json& request) {
   const std::vector<std::string> names = DSSM_TRY(texts_of(request, "fields", kMaxFields));
-  const std::optional<Time> from = DSSM_TRY(time_of(request, "from_ns"));
+  const std::optional<Time> wanted_from = DSSM_TRY(time_of(request, "from_ns"));
   const std::optional<Time> wanted_to = DSSM_TRY(time_of(request, "to_ns"));
-  const Time to = wanted_to.value_or(WallClock::now());
-  if (!from || *from >= to) return wrong("'from_ns' is to be before 'to_ns'");
+  const std::optional<Time> span = DSSM_TRY(time_of(request, "span_ns"));
+  if (!wanted_to != !wanted_from || !wanted_to == !span) {
+    return bad_request("either 'from_ns' and 'to_ns' are needed, or 'span_ns'");
+  }
+  if (span ? *span <= Time() : *wanted_from >= *wanted_to) {
+    return bad_request("'from_ns' is to be before 'to_ns', and 'span_ns' greater than 0");
+  }
   const auto points = request.find("points");
   if (points == request.end() || !points->is_number_unsigned() ||
       points->get<std::uint64_t>() < 2 || points->get<std::uint64_t>() > kMaxPoints) {
-    return wrong(fmt::format("'points' is to be a number from 2 to {}", kMaxPoints));
+    return bad_request(fmt::format("'points' is to be a number from 2 to {}", kMaxPoints));
   }
   DataAnswer answer(id);
-  Json head = {{"to_ns", time_json(to)}};
+  Json head = Json::object();
   const Streams::Found found = streams.find(text_of(request, "stream"));
   if (!found.stream) {
     add_missing(head, found);
@@ -150,10 +154,20 @@ Result<Message> signals_answer(Streams& streams, std::uint32_t id, const Json& r
   std::vector<ctl::FieldElement> fields;
   for (const std::string& name : names) {
     const auto field = ctl::find_field(stream.fields, name);
-    if (!field) return wrong(fmt::format("the stream has no field '{}'", name));
+    if (!field) return bad_request(fmt::format("the stream has no field '{}'", name));
     fields.push_back(*field);
   }
-  SignalRange range = read_signals(stream.reader, fields, *from, to, points->get<std::size_t>());
+  Time to = wanted_to.value_or(Time()), from = wanted_from.value_or(Time());
+  if (span) {
+    SampleInfo newest;
+    if (stream.reader.read_info(stream.reader.newest_tid(), newest) == ReadStatus::ok) {
+      to = newest.time;
+    }
+    from = ctl::saturating_add(to, -span->time_since_epoch());
+  }
+  head["from_ns"] = time_json(from);
+  head["to_ns"] = time_json(to);
+  SignalRange range = read_signals(stream.reader, fields, from, to, points->get<std::size_t>());
   if (range.status == ReadStatus::restarted) {
     stream.follow_restart();
     range = {};
@@ -229,7 +243,7 @@ Result<Message> at_answer(Streams& streams, std::uint32_t id, const Json& reques
     if (found.stream) bytes += found.stream->reader.payload_bytes();
   }
   if (bytes > kMaxPayloadBytes) {
-    return wrong(
+    return bad_request(
         fmt::format("samples of these streams may have {} bytes together; at most {} are "
                     "sent at once",
                     bytes, kMaxPayloadBytes));
@@ -297,8 +311,9 @@ class PageConnection : public Connection {
     }
     Result<Message> answer = op == "type"      ? type_answer(pages_.streams_, number, request)
                              : op == "signals" ? signals_answer(pages_.streams_, number, request)
-                             : op == "at"      ? at_answer(pages_.streams_, number, request)
-                                          : wrong(fmt::format("there is no operation '{}'", op));
+                             : op == "at"
+                                 ? at_answer(pages_.streams_, number, request)
+                                 : bad_request(fmt::format("there is no operation '{}'", op));
     if (!answer) {
       answer = Message::text(ctl::json_text({{"id", number}, {"error", answer.error().message}}));
     }

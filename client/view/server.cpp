@@ -148,6 +148,19 @@ Result<std::uint16_t> Server::listen() {
   library.files.def = "index.html";
   library.files.cache_revalidate = kRevalidate;
 
+  for (const auto& [path, text] : texts_) {
+    lws_http_mount mount{};
+    mount.mount_next = library.texts.empty() ? &library.files : nullptr;
+    mount.mountpoint = path.c_str();
+    mount.mountpoint_len = static_cast<unsigned char>(path.size());
+    mount.origin_protocol = LWSMPRO_CALLBACK;
+    mount.protocol = "http";
+    library.texts.push_back(mount);
+  }
+  for (std::size_t i = 1; i < library.texts.size(); ++i) {
+    library.texts[i].mount_next = &library.texts[i - 1];
+  }
+
   // Also against what the page itself may be made to do by a name that it shows.
   auto add_header = [&, n = 0U](const char* name, const char* value) mutable {
     library.headers[n] = {n > 0 ? &library.headers[n - 1] : nullptr, nullptr, name, value};
@@ -176,7 +189,7 @@ Result<std::uint16_t> Server::listen() {
   info.port = options_.port;
   info.iface = library.address.c_str();
   info.protocols = library.protocols.data();
-  info.mounts = &library.files;
+  info.mounts = library.texts.empty() ? &library.files : &library.texts.back();
   info.headers = &library.headers.back();
   info.user = this;
   info.options = LWS_SERVER_OPTION_FAIL_UPON_UNABLE_TO_BIND | LWS_SERVER_OPTION_VALIDATE_UTF8;
@@ -292,7 +305,7 @@ int Server::on_event(lws* connection, int reason, void* user, void* in, std::siz
 bool Server::on_http(lws* connection, int reason, std::uint64_t& request, void* in) {
   switch (reason) {
     case LWS_CALLBACK_HTTP:
-      return begin_text(connection, request, static_cast<const char*>(in));
+      return begin_text(connection, request, header(connection, WSI_TOKEN_GET_URI));
     case LWS_CALLBACK_HTTP_WRITEABLE: {
       const auto found = requests_.find(request);
       if (found == requests_.end()) return true;

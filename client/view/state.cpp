@@ -16,8 +16,6 @@ namespace {
 
 using ctl::Json;
 
-Json time_json(Time time) { return std::to_string(to_ns(time)); }
-
 bool is_up(HostState state) { return state == HostState::up || state == HostState::self; }
 
 // The time of the oldest sample that the stream's ring holds, about: by its rate.

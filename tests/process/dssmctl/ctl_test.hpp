@@ -59,6 +59,7 @@ class Running {
   void signal(int number);
   void stop();   // SIGSTOP, and waits until it stands still
   int status();  // waits for its end
+  pid_t pid() const { return pid_; }
 
  private:
   bool take_line(std::string& line);

@@ -1,0 +1,106 @@
+#!/usr/bin/python3
+# SPDX-License-Identifier: Apache-2.0
+#
+# A client of dssm-view, by python3-websockets.
+#
+#   client.py ask URL    Sends each line of standard input, a JSON object, as a request of the page's
+#                        protocol (with an id of its own, if it has none), and prints its answer as a
+#                        line. Data are at their keys: "times", "values", "tids" of curves, "payload"
+#                        of samples as hex. What is being opened or is on its way is asked for again.
+#   client.py send URL   Sends the lines as they are, and prints what comes until the server closes:
+#                        then code and reason.
+#   client.py hold URL   Subscribes to the first channel of Foxglove's protocol and prints "ready";
+#                        then sleeps and reads nothing until it is told to by a line of standard
+#                        input: prints how many samples and which status messages come then.
+import asyncio
+import json
+import struct
+import sys
+
+import websockets
+
+PAGE = "dssm.view.v1"
+FOXGLOVE = "foxglove.sdk.v1"
+MESSAGE_DATA = 1
+
+
+def decoded(answer):
+    """An answer of the page's protocol with its data in place."""
+    if isinstance(answer, str):
+        return json.loads(answer)
+    number, head_bytes = struct.unpack_from("<II", answer)
+    head = json.loads(answer[8 : 8 + head_bytes])
+    head["id"] = number
+    data = answer[8 + head_bytes :]
+    assert (8 + head_bytes) % 8 == 0
+    for curve in head.get("curves", []):
+        for key in ["times", "values", "tids"]:
+            at = curve.pop(key + "_at")
+            assert at % 8 == 0
+            numbers = struct.unpack_from(f"<{curve['points']}d", data, at)
+            curve[key] = [None if number != number else number for number in numbers]
+    for sample in head.get("samples", []) if isinstance(head.get("samples"), list) else []:
+        if "payload_at" in sample:
+            at = sample.pop("payload_at")
+            sample["payload"] = data[at : at + sample["payload_bytes"]].hex()
+    return head
+
+
+def is_underway(answer):
+    statuses = [answer.get("status")]
+    if isinstance(answer.get("samples"), list):
+        statuses += [sample["status"] for sample in answer["samples"]]
+    return any(status in ("opening", "arriving", "restarted") for status in statuses)
+
+
+async def ask(url):
+    async with websockets.connect(url, subprotocols=[PAGE], max_size=None) as server:
+        for number, line in enumerate(sys.stdin):
+            request = {"id": number, **json.loads(line)}
+            while True:
+                await server.send(json.dumps(request))
+                answer = decoded(await server.recv())
+                if not is_underway(answer):
+                    break
+                await asyncio.sleep(0.02)
+            print(json.dumps(answer))
+
+
+async def send(url):
+    async with websockets.connect(url, subprotocols=[PAGE], max_size=None) as server:
+        try:
+            for line in sys.stdin:
+                await server.send(line.rstrip("\n"))
+            while True:
+                print(json.dumps(decoded(await server.recv())))
+        except websockets.ConnectionClosed as closed:
+            print(closed.code, closed.reason)
+
+
+async def hold(url):
+    async with websockets.connect(
+        url, subprotocols=[FOXGLOVE], max_size=None, max_queue=1, ping_interval=None
+    ) as server:
+        channel = None
+        while channel is None:
+            message = json.loads(await server.recv())
+            if message["op"] == "advertise":
+                channel = message["channels"][0]["id"]
+        subscription = {"id": 0, "channelId": channel}
+        await server.send(json.dumps({"op": "subscribe", "subscriptions": [subscription]}))
+        print("ready", flush=True)
+        sys.stdin.readline()
+        samples = 0
+        while True:
+            message = await server.recv()
+            if isinstance(message, bytes):
+                samples += message[0] == MESSAGE_DATA
+                continue
+            message = json.loads(message)
+            if message["op"] == "status":
+                print(samples, message["message"], flush=True)
+                return
+
+
+if __name__ == "__main__":
+    asyncio.run({"ask": ask, "send": send, "hold": hold}[sys.argv[1]](sys.argv[2]))

@@ -1,0 +1,367 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// dssm-view as a browser, Foxglove and Prometheus meet it. The clients are other authors': Python's
+// http.client and websockets (client.py), and Foxglove's own library (foxglove/client.cjs).
+#include <fcntl.h>
+
+#include <fstream>
+
+#include "tests/process/dssmctl/fleet_test.hpp"
+#include "tests/support/samples.hpp"
+
+namespace dssm::test {
+namespace {
+
+struct Motion {
+  double x;
+  float speed[3];
+  std::int32_t wheel;
+};
+DSSM_DESCRIBE(Motion, x, speed, wheel)
+
+std::string source(const std::string& path) {
+  const char* root = std::getenv("DSSM_SOURCE_ROOT");  // NOLINT(concurrency-mt-unsafe)
+  return std::string(root == nullptr ? "." : root) + "/" + path;
+}
+
+std::vector<std::string> view_argv(std::vector<std::string> words) {
+  std::vector<std::string> argv = {built("client/view/dssm-view"), "--pages",
+                                   source("client/view/web")};
+  argv.insert(argv.end(), words.begin(), words.end());
+  return argv;
+}
+
+class View : public FleetTest {
+ protected:
+  View() {
+    const std::string line = view_.line();
+    const std::size_t at = line.find("http://");
+    EXPECT_NE(at, std::string::npos) << line;
+    if (at != std::string::npos) url_ = line.substr(at);
+  }
+
+  std::string websocket_url() const { return "ws" + url_.substr(4); }
+
+  // What client.py prints, line by line.
+  std::vector<std::string> client(const std::string& what, const std::vector<std::string>& lines) {
+    std::string input;
+    for (const std::string& line : lines) input += line + "\n";
+    const Finished finished =
+        run({"/usr/bin/python3", source("tests/process/view/client.py"), what, websocket_url()}, {},
+            input);
+    EXPECT_EQ(finished.exit_status, 0) << finished.err;
+    return lines_of(finished.out);
+  }
+  Json ask(const Json& request) {
+    const std::vector<std::string> answers = client("ask", {request.dump()});
+    return answers.size() == 1 ? Json::parse(answers[0]) : Json();
+  }
+
+  // Status and body of a GET.
+  std::pair<int, std::string> get(const std::string& path, const std::string& header = "",
+                                  const std::string& value = "") {
+    const Finished finished =
+        run({"/usr/bin/python3", "-c",
+             "import sys, http.client, urllib.parse\n"
+             "url, path, name, value = sys.argv[1:]\n"
+             "client = http.client.HTTPConnection(urllib.parse.urlsplit(url).netloc)\n"
+             "client.request('GET', path, headers={name: value} if name else {})\n"
+             "answer = client.getresponse()\n"
+             "print(answer.status)\n"
+             "print(answer.getheader('content-type'))\n"
+             "print(answer.read().decode())\n",
+             url_, path, header, value});
+    EXPECT_EQ(finished.exit_status, 0) << finished.err;
+    return {std::atoi(finished.out.c_str()), finished.out};
+  }
+
+  Running view_{view_argv({"--listen", "127.0.0.1:0"}), environment()};
+  std::string url_;
+};
+
+// --- the server
+
+TEST_F(View, ServesItsPageAndTheMetrics) {
+  const auto page = get("/");
+  EXPECT_EQ(page.first, 200);
+  EXPECT_TRUE(contains(page.second, "text/html")) << page.second;
+  EXPECT_EQ(get("/main.js").first, 200);
+  const auto metrics = get("/metrics");
+  EXPECT_EQ(metrics.first, 200);
+  EXPECT_TRUE(contains(metrics.second, "application/openmetrics-text")) << metrics.second;
+  EXPECT_TRUE(contains(metrics.second, "dssm_host_up{host=\"pc2\"} 1\n")) << metrics.second;
+  EXPECT_TRUE(contains(metrics.second, "# EOF\n")) << metrics.second;
+  EXPECT_EQ(get("/nothing").first, 404);
+  EXPECT_EQ(get("/../../../../etc/passwd").first, 404);
+  EXPECT_EQ(get("/%2e%2e/%2e%2e/%2e%2e/%2e%2e/etc/passwd").first, 404);
+}
+
+// Any page that is open in a browser may send requests to this PC.
+TEST_F(View, RefusesPagesOfOthers) {
+  EXPECT_EQ(get("/", "Host", "evil.example").first, 403);
+  EXPECT_EQ(get("/metrics", "Host", "evil.example:8765").first, 403);
+  EXPECT_EQ(get("/", "Host", "localhost:1").first, 200);
+  EXPECT_EQ(get("/", "Host", "[::1]:1").first, 200);
+  const auto refused = [&](const std::string& origin) {
+    const Finished finished =
+        run({"/usr/bin/python3", "-c",
+             "import asyncio, sys, websockets\n"
+             "async def main():\n"
+             "  async with websockets.connect(sys.argv[1], origin=sys.argv[2],\n"
+             "      subprotocols=[sys.argv[3]]): pass\n"
+             "asyncio.run(main())\n",
+             websocket_url(), origin, "dssm.view.v1"});
+    return finished.exit_status != 0 && contains(finished.err, "403");
+  };
+  EXPECT_TRUE(refused("http://evil.example"));
+  EXPECT_TRUE(refused("null"));
+  EXPECT_FALSE(refused(url_.substr(0, url_.size() - 1)));
+}
+
+TEST_F(View, RefusesWhatIsNotARequestAndGoesOn) {
+  const auto closed = [&](const std::string& line) { return client("send", {line}).back(); };
+  EXPECT_TRUE(closed("no json").starts_with("1008 a request is to be a JSON object"));
+  EXPECT_TRUE(closed("[1]").starts_with("1008 "));
+  EXPECT_TRUE(closed(R"({"op":"overview"})").starts_with("1008 "));
+  EXPECT_TRUE(closed(R"({"op":"overview","id":-1})").starts_with("1008 "));
+  EXPECT_TRUE(closed(std::string(70'000, ' ')).starts_with("1008 a message is larger than"));
+  EXPECT_TRUE(client("send", std::vector<std::string>(17, R"({"op":"overview","id":1})"))
+                  .back()
+                  .starts_with("1008 too many requests"));
+
+  const auto error = [&](const Json& request) { return ask(request).value("error", ""); };
+  EXPECT_EQ(error({{"op", "sing"}}), "there is no operation 'sing'");
+  EXPECT_TRUE(contains(error({{"op", "at"}}), "'streams' is to be a list"));
+  EXPECT_TRUE(contains(error({{"op", "at"}, {"streams", {1}}}), "strings only"));
+  EXPECT_TRUE(contains(error({{"op", "at"}, {"streams", Json::array()}, {"t_ns", 5}}), "'t_ns'"));
+  EXPECT_TRUE(
+      contains(error({{"op", "at"}, {"streams", Json::array()}, {"t_ns", "5x"}}), "'t_ns'"));
+  EXPECT_TRUE(contains(error({{"op", "signals"}, {"fields", Json::array()}}), "'span_ns'"));
+  const Json signals = {{"op", "signals"}, {"fields", {"x"}}, {"stream", "motion:0@pc1"},
+                        {"from_ns", "10"}, {"to_ns", "10"},   {"points", 10}};
+  EXPECT_TRUE(contains(error(signals), "before 'to_ns'"));
+  EXPECT_TRUE(contains(
+      error({{"op", "signals"}, {"fields", {"x"}}, {"span_ns", "10"}, {"points", 1}}), "'points'"));
+  const Json missing = ask({{"op", "at"}, {"streams", {"nothing", ""}}});
+  EXPECT_EQ(missing["samples"][0]["status"], "unavailable") << missing;
+  EXPECT_TRUE(contains(missing["samples"][0].value("error", ""), "nothing")) << missing;
+  EXPECT_EQ(missing["samples"][1]["status"], "unavailable") << missing;
+}
+
+// --- the page's protocol
+
+TEST_F(View, ShowsHostsStreamsAndPrograms) {
+  auto motion = session_.create<Motion>("motion", depth_of(8)).value();
+  motion.write({});
+  auto lidar = on_pc2_.create<double>("lidar:3", depth_of(8)).value();
+  Json overview;
+  await([&] {
+    overview = ask({{"op", "overview"}});
+    return overview["streams"].size() == 2 && overview.value("nodes", Json()).size() == 2;
+  });
+  EXPECT_EQ(overview["host"], "pc1");
+  EXPECT_EQ(overview["error"], "");
+  EXPECT_EQ(overview["recording"], nullptr);
+  EXPECT_EQ(overview["hosts"].size(), 3U);
+  EXPECT_EQ(overview["streams"][0]["stream"], "motion:0@pc1");
+  EXPECT_EQ(overview["streams"][0]["writers"], 1);
+  EXPECT_EQ(overview["streams"][1]["stream"], "lidar:3@pc2");
+  EXPECT_EQ(overview["nodes"][0]["program"], "the test");
+  EXPECT_FALSE(overview["findings"].empty());
+  EXPECT_EQ(overview["range"]["newest_ns"], overview["streams"][0]["newest_ns"]);
+
+  pc3_.kill_hard();
+  await([&] {
+    overview = ask({{"op", "overview"}});
+    const Json& events = overview["events"];
+    return std::any_of(events.begin(), events.end(), [](const Json& event) {
+      return event["severity"] == "warn" &&
+             contains(event["text"].get<std::string>(), "host pc3 is down");
+    });
+  });
+  const auto pc3 = std::find_if(overview["hosts"].begin(), overview["hosts"].end(),
+                                [](const Json& host) { return host["host"] == "pc3"; });
+  ASSERT_NE(pc3, overview["hosts"].end());
+  EXPECT_EQ((*pc3)["state"], "down") << overview["hosts"];
+}
+
+TEST_F(View, SaysSoWhileDssmdIsGone) {
+  ASSERT_EQ(ask({{"op", "overview"}})["error"], "");
+  daemon_.kill_hard();
+  await([&] { return ask({{"op", "overview"}})["error"] != ""; });
+  EXPECT_EQ(get("/").first, 200);
+  EXPECT_EQ(get("/metrics").first, 503);
+  daemon_.start();
+  await([&] { return ask({{"op", "overview"}})["error"] == ""; });
+}
+
+TEST_F(View, GivesTheTypeAndTheFields) {
+  auto motion = session_.create<Motion>("motion", depth_of(8)).value();
+  auto plain = session_.create_raw({"plain"}, TypeInfo{"", 5, 1, {}}, depth_of(8)).value();
+  const Json type = ask({{"op", "type"}, {"stream", "motion:0@pc1"}});
+  EXPECT_EQ(type["status"], "ok");
+  EXPECT_EQ(type["name"], "Motion");
+  EXPECT_EQ(type["payload_bytes"], sizeof(Motion));
+  EXPECT_EQ(type["fields"].size(), 3U);
+  EXPECT_EQ(type["fields"][1]["name"], "speed");
+  EXPECT_EQ(type["fields"][1]["count"], 3);
+  EXPECT_EQ(type["fields"][1]["offset_bytes"], offsetof(Motion, speed));
+  EXPECT_TRUE(ask({{"op", "type"}, {"stream", "plain:0@pc1"}})["fields"].empty());
+}
+
+TEST_F(View, ShowsAllStreamsAtOneTime) {
+  auto motion = session_.create<Motion>("motion", depth_of(64)).value();
+  auto lidar = on_pc2_.create<std::int64_t>("lidar", depth_of(64)).value();
+  auto late = session_.create<std::int64_t>("late", depth_of(64)).value();
+  for (int i = 0; i < 40; ++i) {
+    motion.write({0.5 * i, {1, 2, 3}, i}, at_ns(kSecond + i * 10'000'000));
+    if (i % 4 == 0) lidar.write(i, at_ns(kSecond + i * 10'000'000 + 1));
+  }
+  late.write(7, at_ns(9 * kSecond));
+  await_streams(1);
+  const std::string t = std::to_string(kSecond + 205'000'000);
+  const Json at =
+      ask({{"op", "at"}, {"streams", {"motion:0@pc1", "lidar:0@pc2", "late:0@pc1"}}, {"t_ns", t}});
+  EXPECT_EQ(at["t_ns"], t);
+  const Json& samples = at["samples"];
+  ASSERT_EQ(samples.size(), 3U) << at;
+  EXPECT_EQ(samples[0]["tid"], 20) << at;
+  EXPECT_EQ(samples[0]["time_ns"], std::to_string(kSecond + 200'000'000));
+  EXPECT_EQ(samples[0]["payload_bytes"], sizeof(Motion));
+  // As a person sees the same sample in a terminal.
+  const Json echoed = json({"echo", "motion", "--at", "1.205"});
+  EXPECT_EQ(echoed["tid"], samples[0]["tid"]);
+  EXPECT_EQ(samples[1]["tid"], 5) << at;
+  EXPECT_EQ(samples[2]["status"], "too_old") << at;
+  EXPECT_FALSE(samples[2].contains("payload"));
+
+  const Json now = ask({{"op", "at"}, {"streams", {"motion:0@pc1", "late:0@pc1"}}});
+  EXPECT_EQ(now["samples"][0]["tid"], 39);
+  EXPECT_EQ(now["samples"][1]["payload"], "0700000000000000");
+}
+
+TEST_F(View, LosesNoPeakOfASignal) {
+  constexpr int kSamples = 20'000, kPeak = 12'345;
+  auto motion = session_.create<Motion>("motion", depth_of(kSamples + 1)).value();
+  for (int i = 0; i < kSamples; ++i) {
+    motion.write({i == kPeak ? 99.0 : i % 2 * 0.1, {0, static_cast<float>(i), 0}, 1},
+                 at_ns(kSecond + i * 1'000'000));
+  }
+  const Json signals = ask({{"op", "signals"},
+                            {"stream", "motion:0@pc1"},
+                            {"fields", {"x", "speed[1]"}},
+                            {"span_ns", "20000000000"},
+                            {"points", 200}});
+  EXPECT_EQ(signals["samples"], kSamples);
+  EXPECT_EQ(signals["lost"], 0);
+  ASSERT_EQ(signals["curves"].size(), 2U) << signals;
+  const Json& x = signals["curves"][0];
+  EXPECT_LE(x["points"], 202);
+  EXPECT_GE(x["points"], 180);
+  const auto values = x["values"].get<std::vector<double>>();
+  const auto peak = std::ranges::find(values, 99.0);
+  ASSERT_NE(peak, values.end());
+  EXPECT_EQ(x["tids"][static_cast<std::size_t>(peak - values.begin())], kPeak);
+  const auto times = x["times"].get<std::vector<double>>();
+  EXPECT_TRUE(std::ranges::is_sorted(times));
+  EXPECT_EQ(signals["curves"][1]["values"].back(), kSamples - 1);
+
+  // Of a part with fewer samples than points, all; and one before and after it.
+  const Json part = ask({{"op", "signals"},
+                         {"stream", "motion:0@pc1"},
+                         {"fields", {"wheel"}},
+                         {"from_ns", std::to_string(kSecond + 100'500'000)},
+                         {"to_ns", std::to_string(kSecond + 110'500'000)},
+                         {"points", 200}});
+  EXPECT_EQ(part["curves"][0]["tids"].front(), 100) << part;
+  EXPECT_EQ(part["curves"][0]["tids"].back(), 111) << part;
+  EXPECT_EQ(part["curves"][0]["points"], 12) << part;
+}
+
+TEST_F(View, FollowsAStreamThatIsCreatedAgain) {
+  auto motion = std::optional(session_.create<Motion>("motion", depth_of(8)).value());
+  motion->write({1, {}, 0});
+  const Json request = {{"op", "at"}, {"streams", {"motion:0@pc1"}}};
+  EXPECT_EQ(ask(request)["samples"][0]["tid"], 0);
+  motion->write({2, {}, 0});
+  ASSERT_TRUE(session_.remove(motion->id()));
+  motion = session_.create<Motion>("motion", depth_of(8)).value();
+  motion->write({3, {}, 0});
+  await([&] {
+    const Json sample = ask(request)["samples"][0];
+    return sample["status"] == "ok" && sample["tid"] == 0;
+  });
+}
+
+// --- clients that do not read
+
+TEST_F(View, DelaysNobodyForABrowserThatStands) {
+  auto images = session_.create_raw({"image"}, TypeInfo{"", 1 << 20, 1, {}}, depth_of(8)).value();
+  const std::vector<std::byte> image(1 << 20);
+  await([&] { return ask({{"op", "overview"}})["streams"].size() == 1; });
+  int input[2];
+  ASSERT_EQ(::pipe2(input, O_CLOEXEC), 0);
+  Running client(
+      {"/bin/sh", "-c", "exec \"$@\" <&" + std::to_string(input[0]), "sh", "/usr/bin/python3",
+       source("tests/process/view/client.py"), "hold", websocket_url()},
+      {});
+  ::close(input[0]);
+  ASSERT_EQ(client.line(), "ready");
+  client.stop();
+  const auto resident_kib = [&] {
+    long kib = 0;
+    std::ifstream status("/proc/" + std::to_string(view_.pid()) + "/status");
+    for (std::string line; std::getline(status, line);) {
+      if (line.starts_with("VmRSS:")) kib = std::atol(line.c_str() + 6);
+    }
+    return kib;
+  };
+  await([&] {
+    images.write(image);
+    return session_.stream_info(images.id()).value().readers == 1;
+  });
+  const long before = resident_kib();
+  // Another one is answered meanwhile, each time.
+  for (int i = 0; i < 100; ++i) images.write(image);
+  const Json other = ask({{"op", "at"}, {"streams", {"image:0@pc1"}}});
+  EXPECT_EQ(other["samples"][0]["payload_bytes"], 1 << 20);
+  for (int i = 0; i < 100; ++i) {
+    images.write(image);
+    std::this_thread::sleep_for(std::chrono::milliseconds(2));  // the load's rate
+  }
+  EXPECT_LT(resident_kib() - before, 40 << 10);
+  client.signal(SIGCONT);
+  ASSERT_EQ(::write(input[1], "\n", 1), 1);
+  ::close(input[1]);
+  const std::string line = client.line();
+  EXPECT_TRUE(contains(line, "samples were left out")) << line;
+}
+
+// --- the command line
+
+TEST(ViewCommand, NamesWhatIsWrong) {
+  const auto refused = [](std::vector<std::string> words) {
+    const Finished finished = run(view_argv(std::move(words)), {"DSSM_SOCKET=/nothing"});
+    return std::pair(finished.exit_status, finished.err);
+  };
+  EXPECT_EQ(refused({"--sing"}).first, 2);
+  EXPECT_TRUE(contains(refused({"--listen", "8765"}).second, "not ADDRESS:PORT"));
+  const auto open = refused({"--listen", "0.0.0.0:8765"});
+  EXPECT_EQ(open.first, 2);
+  EXPECT_TRUE(contains(open.second, "--insecure")) << open.second;
+  EXPECT_EQ(refused({"--certificate", "a"}).first, 2);
+  const auto no_daemon = refused({"--listen", "127.0.0.1:0"});
+  EXPECT_EQ(no_daemon.first, 1);
+  EXPECT_TRUE(contains(no_daemon.second, "/nothing")) << no_daemon.second;
+}
+
+TEST_F(View, SaysThatThePortIsInUse) {
+  const std::string port = url_.substr(url_.rfind(':') + 1);
+  const Finished second =
+      run(view_argv({"--listen", "127.0.0.1:" + port.substr(0, port.size() - 1)}), environment());
+  EXPECT_EQ(second.exit_status, 1);
+  EXPECT_TRUE(contains(second.err, "is another dssm-view running")) << second.err;
+}
+
+}  // namespace
+}  // namespace dssm::test
