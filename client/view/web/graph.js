@@ -49,7 +49,7 @@ function boxesOf(streams, nodes) {
   };
   for (const stream of streams) {
     const title = stream.id === 0 ? stream.name : `${stream.name}:${stream.id}`;
-    add(`stream ${stream.id_text}`, "stream", title, stream.host, stream.state ?? "unknown");
+    add(`stream ${stream.stream}`, "stream", title, stream.host, stream.state ?? "unknown");
   }
   const link = (from, to) => {
     from.to.add(to.key);

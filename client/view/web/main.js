@@ -9,7 +9,8 @@ import { Signals } from "./signals.js";
 import { Time, TimeBar } from "./time.js";
 import { Views } from "./views.js";
 
-const kOverviewMs = 1000;
+const kOverviewMs = 200; // the answer comes when there is a new state, about each second
+const kFailedMs = 1000;
 const kAtMs = 50;
 const kOpeningMs = 100;
 const kArrivingMs = 200; // the sample of a held instant is still on its way
@@ -69,7 +70,7 @@ class Types {
 }
 
 function incarnationOf(stream) {
-  return streams().find((one) => one.id_text === stream)?.incarnation ?? null;
+  return streams().find((one) => one.stream === stream)?.incarnation ?? null;
 }
 
 function streams() {
@@ -131,7 +132,6 @@ for (const [i, button] of tabs.entries()) {
 const overviewPump = new Pump(connection, kOverviewMs, async () => {
   const first = overview === null;
   overview = complete(await connection.request("overview"));
-  time.setNow(BigInt(overview.now_ns));
   const range = overview.range && { oldest: BigInt(overview.range.oldest_ns), newest: BigInt(overview.range.newest_ns) };
   time.setRange(range, overview.recording !== null);
   types.forgetRecreated();
@@ -148,7 +148,6 @@ const overviewPump = new Pump(connection, kOverviewMs, async () => {
 // The first answer may come before all is known.
 function complete(answer) {
   for (const list of ["hosts", "streams", "nodes", "findings", "events"]) answer[list] ??= [];
-  for (const stream of answer.streams) stream.id_text ??= stream.stream;
   answer.range ??= null;
   answer.recording ??= null;
   return answer;
@@ -165,15 +164,14 @@ const atPump = new Pump(connection, kAtMs, async () => {
     answer = await connection.request("at", { streams: wanted, t_ns: t === null ? null : String(t), payloads: true });
   } catch (error) {
     if (!(error instanceof RequestError)) throw error;
-    shown.showSamples(t ?? time.now(), new Map(wanted.map((stream) => [stream, failed(error.message)])));
-    return kOverviewMs;
+    shown.showSamples(t ?? 0n, new Map(wanted.map((stream) => [stream, failed(error.message)])));
+    return kFailedMs;
   }
-  const at = answer.head.t_ns ? BigInt(answer.head.t_ns) : t ?? time.now();
   const samples = new Map(answer.head.samples.map((one) => [one.stream, sampleOf(one, answer)]));
+  const at = t ?? newestOf(samples); // the newest of each is shown as of the newest of all
   if (shown === page()) {
     shown.showSamples(at, samples);
-    if (t === null) time.setNow(at);
-    time.setShown(at);
+    if (at !== null) time.setShown(at);
   }
   const has = (status) => answer.head.samples.some((one) => one.status === status);
   if (has("opening")) return kOpeningMs;
@@ -181,6 +179,14 @@ const atPump = new Pump(connection, kAtMs, async () => {
   return has("arriving") || has("not yet") ? kArrivingMs : null;
 });
 time.addEventListener("change", () => atPump.wake());
+
+function newestOf(samples) {
+  let newest = null;
+  for (const { timeNs } of samples.values()) {
+    if (timeNs !== null && (newest === null || timeNs > newest)) newest = timeNs;
+  }
+  return newest;
+}
 
 function sampleOf(one, answer) {
   const has = one.payload_at !== undefined && one.payload_at !== null;
@@ -204,8 +210,8 @@ function failed(error) {
 async function step(count) {
   time.hover = null;
   const stream = views.root.hidden ? signals.chosenStreams()[0] : views.stepStream();
-  const start = time.t ?? time.shown ?? time.now();
-  if (stepping) return;
+  const start = time.t ?? time.shown;
+  if (stepping || start === null) return;
   stepping = true;
   time.hold(start);
   try {
@@ -234,7 +240,7 @@ async function neighbour(stream, t, direction) {
   if (!here) return null;
   if (direction < 0) return (await at(here.ns - 1n))?.ns ?? null;
   // Ahead by a cycle, then by more; and back, should that skip samples.
-  const cycle = streams().find((one) => one.id_text === stream)?.cycle_ns;
+  const cycle = streams().find((one) => one.stream === stream)?.cycle_ns;
   let ahead = cycle > 0 ? BigInt(cycle) : 10000000n;
   let next = null;
   for (let i = 0; i < kMaxSteps && !next; ++i, ahead *= 2n) {

@@ -93,10 +93,10 @@ export class Signals extends EventTarget {
     if (this.panels.length > 0 || this.suggested || this.streams().length === 0) return;
     this.suggested = true;
     for (const stream of this.streams()) {
-      const type = await this.types.ask(stream.id_text);
+      const type = await this.types.ask(stream.stream);
       const names = type ? signalsOf(type).filter((one) => !one.count).slice(0, kFewFields) : [];
       if (names.length === 0) continue;
-      this.addPanel(names.map((one) => ({ stream: stream.id_text, field: one.name })));
+      this.addPanel(names.map((one) => ({ stream: stream.stream, field: one.name })));
       if (this.panels.length === 2) break;
     }
     if (this.panels.length === 0) this.addPanel([]);
@@ -327,7 +327,7 @@ export class Signals extends EventTarget {
       if (!type) continue;
       const answer = await this.askStream(stream, type, live, kPoints);
       opening ||= answer.status === "opening";
-      if (newest === null || answer.to > newest) newest = answer.to;
+      if (answer.to && (newest === null || answer.to > newest)) newest = answer.to;
     }
     if (live && this.time.mode === "live" && newest !== null) {
       this.window = { from: newest - this.spanNs(), to: newest };
@@ -343,9 +343,10 @@ export class Signals extends EventTarget {
     const names = [...new Set(all.filter((one) => one.stream === stream).map((one) => one.field))];
     const fields = names.filter((name) => findField(type, name));
     if (!live && !this.window) this.keepInWindow();
-    const from = live ? this.time.now() - this.spanNs() : this.window.from;
-    const to = live ? null : this.window.to;
-    const answer = { status: "ok", error: "", from, to: to ?? this.time.now(), curves: new Map() };
+    if (!live && !this.window) return { status: "ok", curves: new Map() };
+    const span = live ? { span_ns: String(this.spanNs()) }
+      : { from_ns: String(this.window.from), to_ns: String(this.window.to) };
+    const answer = { status: "ok", error: "", from: this.window?.from ?? null, to: null, curves: new Map() };
     this.answers.set(stream, answer);
     if (fields.length === 0) {
       answer.error = `'${stream}' has no field '${names[0]}'`;
@@ -353,13 +354,12 @@ export class Signals extends EventTarget {
     }
     try {
       const binary = await this.connection.request("signals", {
-        stream, fields, from_ns: String(from), to_ns: to === null ? null : String(to), points });
+        stream, fields, ...span, points });
       const { head } = binary;
       Object.assign(answer, { status: head.status, error: head.error ?? "", lost: head.lost ?? 0,
         count: head.samples ?? 0, clockErrorS: head.clock_error_s ?? null });
       if (head.from_ns) answer.from = BigInt(head.from_ns);
       if (head.to_ns) answer.to = BigInt(head.to_ns);
-      if (to === null) this.time.setNow(answer.to);
       for (const curve of head.curves ?? []) {
         answer.curves.set(curve.field, {
           times: binary.doubles(curve.times_at, curve.points),
@@ -410,7 +410,6 @@ export class Signals extends EventTarget {
   // The samples at the shown instant, from the page's `at` request.
   showSamples(t, samples) {
     this.samples = samples;
-    this.cursorT = t;
     this.drawCursor();
     this.showValues();
   }
@@ -434,16 +433,17 @@ export class Signals extends EventTarget {
 
   // The instant in all panels, with the clock error of the panel's samples around it.
   drawCursor() {
-    const t = this.time.hover ?? this.time.t ?? this.cursorT;
+    const t = this.time.instant();
     for (const panel of this.panels) {
       if (!panel.plot || this.epoch === null) continue;
-      const inside = t !== undefined && t !== null && this.window && t >= this.window.from && t <= this.window.to;
+      const error = this.clockErrorOf(panel);
+      panel.element.dataset.clockErrorNs = error === null ? "" : String(Math.round(error * 1e9));
+      const inside = t !== null && this.window && t >= this.window.from && t <= this.window.to;
       panel.line.hidden = !inside;
       panel.band.hidden = !inside;
       if (!inside) continue;
       const x = this.toX(t);
       panel.line.style.left = `${panel.plot.valToPos(x, "x")}px`;
-      const error = this.clockErrorOf(panel);
       panel.band.hidden = error === null;
       if (error === null) continue;
       const left = panel.plot.valToPos(x - error, "x");
@@ -451,7 +451,6 @@ export class Signals extends EventTarget {
       panel.band.style.left = `${left}px`;
       panel.band.style.width = `${right - left}px`;
       panel.band.title = `Clock error \u00b1${duration(error * 1e9)}`;
-      panel.element.dataset.clockErrorNs = String(Math.round(error * 1e9));
     }
   }
 
@@ -567,7 +566,7 @@ class Picker {
     this.list.replaceChildren();
     if (!this.dialog.open) this.dialog.showModal();
     this.filter.focus();
-    await Promise.all(this.signals.streams().map((stream) => this.signals.types.ask(stream.id_text)));
+    await Promise.all(this.signals.streams().map((stream) => this.signals.types.ask(stream.stream)));
     this.show();
   }
 
@@ -576,12 +575,12 @@ class Picker {
     const fits = (text) => words.every((word) => text.toLowerCase().includes(word));
     const groups = [];
     for (const stream of this.signals.streams()) {
-      const type = this.signals.types.get(stream.id_text);
+      const type = this.signals.types.get(stream.stream);
       if (!type) continue;
-      const all = signalsOf(type).filter((one) => fits(`${stream.id_text} ${one.name}`));
+      const all = signalsOf(type).filter((one) => fits(`${stream.stream} ${one.name}`));
       if (all.length === 0 && (words.length > 0 || type.fields.length > 0)) continue;
-      groups.push(element("fieldset", {}, element("legend", {}, stream.id_text),
-        ...(all.length > 0 ? all.map((one) => this.entry(stream.id_text, one))
+      groups.push(element("fieldset", {}, element("legend", {}, stream.stream),
+        ...(all.length > 0 ? all.map((one) => this.entry(stream.stream, one))
           : [element("p", { class: "note" }, "Its type has no description, so its fields are not known.")])));
     }
     if (groups.length === 0) groups.push(element("p", { class: "empty" }, "Nothing fits."));

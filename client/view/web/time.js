@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The instant that the page shows: one for all plots and views. Times are BigInt, ns since 1970, of
-// the clock of dssm-view's host.
+// The instant that the page shows: one for all plots and views. Times are BigInt, ns since 1970.
+// Only times of samples are used: those of a recording that is played back are not the present.
 //
 //   live   the newest samples
 //   hold   the samples at `t`
@@ -24,26 +24,11 @@ export class Time extends EventTarget {
     this.range = null; // {oldest, newest}
     this.recording = false;
     this.speed = 1;
-    this.nowNs = 0n;
-    this.nowAt = 0;
   }
 
   // The instant to ask for; null: the newest.
   instant() {
     return this.hover ?? this.t;
-  }
-
-  now() {
-    return this.nowNs + BigInt(Math.round((performance.now() - this.nowAt) * 1e6));
-  }
-
-  // An answer can only be late, so the latest clock counts, unless the clock was set.
-  setNow(ns) {
-    const kSetBackNs = 3000000000n;
-    const now = this.now();
-    if (ns < now && now - ns < kSetBackNs) return;
-    this.nowNs = ns;
-    this.nowAt = performance.now();
   }
 
   // What the rings hold, or the recording.
@@ -63,8 +48,8 @@ export class Time extends EventTarget {
   }
 
   // Holds `t`, or what is shown now.
-  hold(t = this.hover ?? this.shown ?? this.now()) {
-    this.set("hold", t);
+  hold(t = this.hover ?? this.shown ?? this.range?.newest ?? null) {
+    if (t !== null) this.set("hold", t);
   }
 
   play() {
@@ -161,7 +146,7 @@ export class TimeBar {
     const shown = time.shown;
     if (shown === null) return;
     this.shown.dataset.tNs = String(shown);
-    const reference = time.recording ? time.range?.oldest : time.now();
+    const reference = time.recording ? time.range?.oldest : time.range?.newest;
     const distance = reference === undefined ? 0n : shown - reference;
     const sign = distance < 0n ? "\u2212" : "+";
     const seconds = `${sign}${(Math.abs(Number(distance)) / 1e9).toFixed(3)} s`;

@@ -63,8 +63,8 @@ export class Views extends EventTarget {
     const order = ["scan", "pose", "image", "table", "hex"];
     const kinds = new Map();
     for (const stream of streams) {
-      const type = await this.types.ask(stream.id_text);
-      kinds.set(stream.id_text, type ? guessKind(type) : "hex");
+      const type = await this.types.ask(stream.stream);
+      kinds.set(stream.stream, type ? guessKind(type) : "hex");
     }
     const sorted = [...kinds].sort(([, a], [, b]) => order.indexOf(a) - order.indexOf(b));
     for (const [stream] of sorted.slice(0, kSuggested)) this.add({ stream });
@@ -98,7 +98,7 @@ export class Views extends EventTarget {
   }
 
   showStreams() {
-    const names = this.streams().map((stream) => stream.id_text);
+    const names = this.streams().map((stream) => stream.stream);
     const key = JSON.stringify(names);
     if (key === this.names) return;
     this.names = key;
@@ -197,7 +197,7 @@ class Card {
       this.rebuild();
     }
     if (type && scanOf(type)) {
-      for (const stream of this.views.streams()) await this.views.types.ask(stream.id_text);
+      for (const stream of this.views.streams()) await this.views.types.ask(stream.stream);
       this.showPlaces();
     }
   }
@@ -243,7 +243,7 @@ class Card {
   }
 
   showPlaces() {
-    const poses = this.views.streams().map((stream) => stream.id_text).filter((stream) => {
+    const poses = this.views.streams().map((stream) => stream.stream).filter((stream) => {
       const type = this.views.types.get(stream);
       return type && poseOf(type)?.theta;
     });
@@ -339,14 +339,16 @@ class Card {
     const pose = type && poseOf(type);
     if (!pose || this.trailS === 0) return false;
     const { time } = this.views;
-    const to = time.t ?? time.now();
-    const from = to - BigInt(this.trailS) * 1000000000n;
+    const spanNs = BigInt(this.trailS) * 1000000000n;
+    const span = time.t === null ? { span_ns: String(spanNs) }
+      : { from_ns: String(time.t - spanNs), to_ns: String(time.t + 1n) };
     try {
       const answer = await this.views.connection.request("signals", { stream, fields: [pose.x.name, pose.y.name],
-        from_ns: String(from), to_ns: String(to), points: kTrailPoints });
+        ...span, points: kTrailPoints });
       if (answer.head.status === "opening") return true;
       const [x, y] = answer.head.curves ?? [];
       if (!x || !y) return false;
+      const from = BigInt(answer.head.from_ns ?? span.from_ns);
       this.trail = joinTrail(from, answer.doubles(x.times_at, x.points), answer.doubles(x.values_at, x.points),
         answer.doubles(y.times_at, y.points), answer.doubles(y.values_at, y.points));
       if (this.samples) this.show(this.t, this.samples);
