@@ -4,7 +4,7 @@
 // its script). The curves of each stream come with one `signals` request; the values at the cursor
 // come with the page's one `at` request, so that they are those of the exact samples.
 import { Pump, RequestError } from "./connection.js";
-import { findField, isFloat, signalsOf, valueOf } from "./fields.js";
+import { findField, guessKind, isFloat, signalsOf, valueOf } from "./fields.js";
 import { cssColor, download, duration, element, number, setText, timeOfDay, wholeDuration } from "./format.js";
 
 const kPeriodMs = 100;
@@ -13,10 +13,12 @@ const kPoints = 800;
 const kExportPoints = 20000; // the most that is answered
 const kSpans = [1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1800, 3600]; // seconds
 const kDefaultSpan = 10;
+const kFewPanels = 2;
 const kFewFields = 3; // shown before a person has chosen
 const kColors = 8;
 const kPlotHeight = 220;
 const kNarrowHeight = 170;
+const kLabelPx = 80; // of the clock error beside the cursor
 const kDragPx = 4; // a shorter way of the pointer is a click
 const kMinZoomNs = 1000n;
 
@@ -92,12 +94,15 @@ export class Signals extends EventTarget {
   async suggest() {
     if (this.panels.length > 0 || this.suggested || this.streams().length === 0) return;
     this.suggested = true;
-    for (const stream of this.streams()) {
-      const type = await this.types.ask(stream.stream);
+    const known = [];
+    for (const { stream } of this.streams()) {
+      const type = await this.types.ask(stream);
       const names = type ? signalsOf(type).filter((one) => !one.count).slice(0, kFewFields) : [];
-      if (names.length === 0) continue;
-      this.addPanel(names.map((one) => ({ stream: stream.stream, field: one.name })));
-      if (this.panels.length === 2) break;
+      if (names.length > 0) known.push({ stream, names, isArray: ["scan", "image"].includes(guessKind(type)) });
+    }
+    known.sort((a, b) => Number(a.isArray) - Number(b.isArray));
+    for (const { stream, names } of known.slice(0, kFewPanels)) {
+      this.addPanel(names.map(({ name }) => ({ stream, field: name })));
     }
     if (this.panels.length === 0) this.addPanel([]);
     this.wakeAll();
@@ -201,11 +206,14 @@ export class Signals extends EventTarget {
       ],
       cursor: { x: false, y: false, points: { show: false }, drag: { x: true, y: false, setScale: false } },
       series: [{}, ...series],
-      hooks: { setSelect: [(plot) => this.onSelect(plot)] },
+      // The place of the cursor is known when the plot has its new scale.
+      hooks: { setSelect: [(plot) => this.onSelect(plot)], draw: [() => this.drawCursorIn(panel)] },
     };
+    panel.line = null; // the new plot draws at once
     panel.plot = new uPlot(options, [[], ...panel.signals.map(() => [])], panel.plotBox);
     panel.band = element("div", { class: "cursor-band", hidden: true });
-    panel.line = element("div", { class: "cursor-line", hidden: true });
+    panel.line = element("div", { class: "cursor-line", hidden: true },
+      element("span", { title: "Bound on the error of the samples' times" }));
     panel.plot.over.append(panel.band, panel.line);
     this.listen(panel);
   }
@@ -433,25 +441,28 @@ export class Signals extends EventTarget {
 
   // The instant in all panels, with the clock error of the panel's samples around it.
   drawCursor() {
+    for (const panel of this.panels) this.drawCursorIn(panel);
+  }
+
+  drawCursorIn(panel) {
+    const { plot, line, band } = panel;
     const t = this.time.instant();
-    for (const panel of this.panels) {
-      if (!panel.plot || this.epoch === null) continue;
-      const error = this.clockErrorOf(panel);
-      panel.element.dataset.clockErrorNs = error === null ? "" : String(Math.round(error * 1e9));
-      const inside = t !== null && this.window && t >= this.window.from && t <= this.window.to;
-      panel.line.hidden = !inside;
-      panel.band.hidden = !inside;
-      if (!inside) continue;
-      const x = this.toX(t);
-      panel.line.style.left = `${panel.plot.valToPos(x, "x")}px`;
-      panel.band.hidden = error === null;
-      if (error === null) continue;
-      const left = panel.plot.valToPos(x - error, "x");
-      const right = panel.plot.valToPos(x + error, "x");
-      panel.band.style.left = `${left}px`;
-      panel.band.style.width = `${right - left}px`;
-      panel.band.title = `Clock error \u00b1${duration(error * 1e9)}`;
-    }
+    if (!line || this.epoch === null) return;
+    const error = this.clockErrorOf(panel);
+    panel.element.dataset.clockErrorNs = error === null ? "" : String(Math.round(error * 1e9));
+    const inside = t !== null && this.window && t >= this.window.from && t <= this.window.to;
+    line.hidden = !inside;
+    band.hidden = !inside || error === null;
+    if (!inside) return;
+    const x = this.toX(t);
+    line.style.left = `${plot.valToPos(x, "x")}px`;
+    setText(line.firstElementChild, error ? `\u00b1${duration(error * 1e9)}` : "");
+    line.classList.toggle("left", plot.valToPos(x, "x") > plot.over.clientWidth - kLabelPx);
+    if (error === null) return;
+    const left = plot.valToPos(x - error, "x");
+    const right = plot.valToPos(x + error, "x");
+    band.style.left = `${left}px`;
+    band.style.width = `${right - left}px`;
   }
 
   clockErrorOf(panel) {

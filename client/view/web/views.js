@@ -315,7 +315,8 @@ class Card {
     if (none) setText(this.note, sample.error || sample.status);
     setText(foot.tid, sample.tid === null ? sample.status : `tid ${sample.tid}`);
     setText(foot.time, sample.timeNs === null ? "" : timeOfDay(sample.timeNs));
-    setText(foot.age, sample.timeNs === null ? "" : `${duration(t - sample.timeNs)} before`);
+    const age = sample.timeNs === null ? 0n : t - sample.timeNs;
+    setText(foot.age, age === 0n ? "" : `${duration(age)} before`);
     foot.age.title = "Before the shown instant";
     setText(foot.error, sample.clockErrorNs === null ? "" : `\u00b1${duration(sample.clockErrorNs)}`);
   }
