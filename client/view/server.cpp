@@ -12,10 +12,13 @@
 #include <cstring>
 #include <utility>
 
+#include "client/dssmctl/text.hpp"
+
 namespace dssm::view {
 namespace {
 
 constexpr std::size_t kMaxRequestBytes = 64U << 10;  // of a WebSocket's message to this server
+constexpr std::size_t kMaxReported = 100;            // different reasons for refusals, each once
 // Browsers ask each time whether a file has changed.
 constexpr int kRevalidate = 1;
 
@@ -288,6 +291,11 @@ int Server::on_event(lws* connection, int reason, void* user, void* in, std::siz
       reason == LWS_CALLBACK_FILTER_PROTOCOL_CONNECTION) {
     const std::string text = server.refusal(connection);
     if (text.empty()) return 0;
+    if (server.reported_.size() < kMaxReported && server.reported_.insert(text).second) {
+      std::fputs(
+          fmt::format("dssm-view: refused a request: {}\n", ctl::escaped_message(text)).c_str(),
+          stderr);
+    }
     lws_return_http_status(connection, HTTP_STATUS_FORBIDDEN, text.c_str());
     return -1;
   }
@@ -329,6 +337,7 @@ bool Server::begin_text(lws* connection, std::uint64_t& request, const std::stri
     lws_return_http_status(connection, HTTP_STATUS_NOT_FOUND, nullptr);
     return lws_http_transaction_completed(connection) == 0;
   }
+  lws_set_timeout(connection, NO_PENDING_TIMEOUT, 0);  // dssmd may need longer than lws waits
   request = ++last_request_;
   requests_.emplace(request, Request{connection, text->second.content_type});
   text->second.make([this, number = request](Result<std::string> made) {

@@ -159,6 +159,7 @@ class Server {
   std::map<std::string, Text> texts_;
   std::map<std::uint64_t, Request> requests_;  // by their numbers, from 1 on
   std::uint64_t last_request_ = 0;
+  std::set<std::string> reported_;  // refusals
   std::vector<std::unique_ptr<Timer>> timers_;
   std::mutex mutex_;
   std::vector<std::function<void()>> posted_;

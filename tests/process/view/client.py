@@ -10,8 +10,7 @@
 #   client.py send URL   Sends the lines as they are, and prints what comes until the server closes:
 #                        then code and reason.
 #   client.py hold URL   Subscribes to the first channel of Foxglove's protocol and prints "ready";
-#                        then sleeps and reads nothing until it is told to by a line of standard
-#                        input: prints how many samples and which status messages come then.
+#                        then how many samples come before the first status message, and that.
 import asyncio
 import json
 import struct
@@ -89,7 +88,6 @@ async def hold(url):
         subscription = {"id": 0, "channelId": channel}
         await server.send(json.dumps({"op": "subscribe", "subscriptions": [subscription]}))
         print("ready", flush=True)
-        sys.stdin.readline()
         samples = 0
         while True:
             message = await server.recv()
