@@ -174,9 +174,9 @@ const atPump = new Pump(connection, kAtMs, async () => {
     if (at !== null) time.setShown(at);
   }
   const has = (status) => answer.head.samples.some((one) => one.status === status);
-  if (has("opening")) return kOpeningMs;
+  if (has("opening") || has("restarted")) return kOpeningMs;
   if (time.mode !== "hold" && time.hover === null) return 0;
-  return has("arriving") || has("not yet") ? kArrivingMs : null;
+  return has("arriving") || has("not_yet") ? kArrivingMs : null;
 });
 time.addEventListener("change", () => atPump.wake());
 
@@ -191,7 +191,7 @@ function newestOf(samples) {
 function sampleOf(one, answer) {
   const has = one.payload_at !== undefined && one.payload_at !== null;
   return {
-    status: one.status,
+    status: one.status.replaceAll("_", " "),
     error: one.error ?? "",
     tid: one.tid ?? null,
     timeNs: one.time_ns === undefined || one.time_ns === null ? null : BigInt(one.time_ns),

@@ -135,6 +135,7 @@ export class TimeBar {
   update() {
     const { time } = this;
     this.root.dataset.mode = time.mode;
+    this.root.dataset.tNs = time.t ?? "";
     this.live.hidden = this.hold.hidden = time.recording;
     this.play.hidden = this.speedLabel.hidden = !time.recording;
     this.live.setAttribute("aria-pressed", String(time.mode === "live"));
