@@ -47,7 +47,7 @@ export function duration(ns) {
   const size = Math.abs(Number(ns));
   const sign = Number(ns) < 0 ? "\u2212" : "";
   const text = (value, unit) => `${sign}${digits(value)} ${unit}`;
-  if (size < 1e3) return text(size, "ns");
+  if (size < 1e3) return `${sign}${size.toFixed(0)} ns`;
   if (size < 1e6) return text(size / 1e3, "\u00b5s");
   if (size < 1e9) return text(size / 1e6, "ms");
   if (size < 120e9) return text(size / 1e9, "s");
@@ -61,6 +61,12 @@ function digits(value) {
   if (value >= 100) return value.toFixed(0);
   if (value >= 10) return value.toFixed(1);
   return value.toFixed(2);
+}
+
+// For people to choose: 90 is "90 s", 120 is "2 min".
+export function wholeDuration(seconds) {
+  if (seconds % 3600 === 0) return `${seconds / 3600} h`;
+  return seconds % 60 === 0 ? `${seconds / 60} min` : `${seconds} s`;
 }
 
 export function bytes(count) {

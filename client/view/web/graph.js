@@ -13,16 +13,21 @@ const kMargin = 6;
 const kSweeps = 8;
 const kNarrow = 560;
 const kMaxText = 20;
+const kNarrowBoxWidth = 104;
+const kNarrowMaxText = 13;
+const kWay = 12; // what a long arrow takes up in the layers that it passes
 
 // nodes: of `overview`; width: the place for the drawing, in CSS pixels.
 export function drawGraph(streams, nodes, width) {
   const boxes = boxesOf(streams, nodes);
-  const layers = order(layersOf(boxes), boxes);
   const down = width < kNarrow;
-  const size = place(layers, down);
+  const shape = { down, width: down ? kNarrowBoxWidth : kBoxWidth, text: down ? kNarrowMaxText : kMaxText };
+  const layers = layersOf(boxes);
+  const arrows = arrowsOf(layers, boxes);
+  const size = place(order(layers, boxes), shape);
   const svg = make("svg", {
     viewBox: `0 0 ${size.width} ${size.height}`, width: size.width, height: size.height,
-    role: "img", "aria-label": describe(boxes),
+    role: "img", "aria-label": describe(arrows),
   });
   const defs = make("defs", {});
   const head = make("marker", { id: "arrow", viewBox: "0 0 8 8", refX: 7, refY: 4, markerWidth: 7,
@@ -30,10 +35,8 @@ export function drawGraph(streams, nodes, width) {
   head.append(make("path", { d: "M0 0.5 L7.5 4 L0 7.5 z", class: "arrow-head" }));
   defs.append(head);
   svg.append(defs);
-  for (const box of boxes.values()) {
-    for (const to of box.to) svg.append(drawArrow(box, boxes.get(to), down));
-  }
-  for (const box of boxes.values()) svg.append(drawBox(box));
+  for (const arrow of arrows) svg.append(drawArrow(arrow, shape));
+  for (const box of boxes.values()) if (box.kind !== "way") svg.append(drawBox(box, shape));
   return svg;
 }
 
@@ -46,7 +49,7 @@ function boxesOf(streams, nodes) {
   };
   for (const stream of streams) {
     const title = stream.id === 0 ? stream.name : `${stream.name}:${stream.id}`;
-    add(`stream ${stream.id_text}`, "stream", title, stream.host, stream.state ?? "unknown");
+    add(`stream ${stream.stream}`, "stream", title, stream.host, stream.state ?? "unknown");
   }
   const link = (from, to) => {
     from.to.add(to.key);
@@ -85,6 +88,36 @@ function layersOf(boxes) {
   return layers.filter((layer) => layer);
 }
 
+// The arrows, each a list of boxes from its writer to its reader. Between layers that are not
+// neighbours it passes a place of its own in each layer between, so that it crosses no box.
+function arrowsOf(layers, boxes) {
+  const layerOf = new Map(layers.flatMap((layer, i) => layer.map((key) => [key, i])));
+  const arrows = [];
+  for (const box of [...boxes.values()]) {
+    for (const key of [...box.to]) {
+      const to = boxes.get(key);
+      const ways = [box];
+      for (let i = layerOf.get(box.key) + 1; i < layerOf.get(key); ++i) {
+        const way = { key: `way ${box.key} ${key} ${i}`, kind: "way", to: new Set(), from: new Set() };
+        boxes.set(way.key, way);
+        layers[i].push(way.key);
+        ways.push(way);
+      }
+      ways.push(to);
+      if (ways.length > 2) {
+        box.to.delete(key);
+        to.from.delete(box.key);
+        for (let i = 0; i + 1 < ways.length; ++i) {
+          ways[i].to.add(ways[i + 1].key);
+          ways[i + 1].from.add(ways[i].key);
+        }
+      }
+      arrows.push(ways);
+    }
+  }
+  return arrows;
+}
+
 // Fewer crossings: each box goes to the mean place of its neighbours, again and again.
 function order(layers, boxes) {
   const at = new Map();
@@ -107,63 +140,68 @@ function order(layers, boxes) {
 }
 
 // Sets x and y of each box, centred in its layer; returns the size of the whole.
-function place(layers, down) {
-  const across = down ? kBoxWidth : kBoxHeight;
-  const along = down ? kBoxHeight : kBoxWidth;
+function place(layers, { down, width }) {
+  const along = down ? kBoxHeight : width;
   const gap = down ? kLayerGap / 2 : kLayerGap;
-  const breadth = (layer) => layer.length * (across + kGap) - kGap;
+  const across = (box) => (box.kind === "way" ? kWay : down ? width : kBoxHeight);
+  const breadth = (layer) => layer.reduce((total, box) => total + across(box) + kGap, -kGap);
   const most = Math.max(0, ...layers.map(breadth));
   layers.forEach((layer, i) => {
-    const start = kMargin + (most - breadth(layer)) / 2;
-    layer.forEach((box, j) => {
-      const u = kMargin + i * (along + gap);
-      const v = start + j * (across + kGap);
+    const u = kMargin + i * (along + gap);
+    let v = kMargin + (most - breadth(layer)) / 2;
+    for (const box of layer) {
       [box.x, box.y] = down ? [v, u] : [u, v];
-    });
+      v += across(box) + kGap;
+    }
   });
   const length = Math.max(0, layers.length * (along + gap) - gap) + 2 * kMargin;
   return down ? { width: most + 2 * kMargin, height: length }
     : { width: length, height: most + 2 * kMargin };
 }
 
-function drawArrow(from, to, down) {
-  const start = down ? [from.x + kBoxWidth / 2, from.y + kBoxHeight]
-    : [from.x + kBoxWidth, from.y + kBoxHeight / 2];
-  const end = down ? [to.x + kBoxWidth / 2, to.y] : [to.x, to.y + kBoxHeight / 2];
+function drawArrow(ways, { down, width }) {
   const bend = (down ? kLayerGap / 2 : kLayerGap) * 0.6;
-  const c1 = down ? [start[0], start[1] + bend] : [start[0] + bend, start[1]];
-  const c2 = down ? [end[0], end[1] - bend] : [end[0] - bend, end[1]];
-  const remote = from.host !== to.host;
+  const middle = (box) => (box.kind === "way" ? kWay : down ? width : kBoxHeight) / 2;
+  const out = (box) => (down ? [box.x + middle(box), box.y + kBoxHeight] : [box.x + width, box.y + middle(box)]);
+  const into = (box) => (down ? [box.x + middle(box), box.y] : [box.x, box.y + middle(box)]);
+  let path = `M${out(ways[0])}`;
+  for (let i = 0; i + 1 < ways.length; ++i) {
+    const start = out(ways[i]);
+    const end = into(ways[i + 1]);
+    const c1 = down ? [start[0], start[1] + bend] : [start[0] + bend, start[1]];
+    const c2 = down ? [end[0], end[1] - bend] : [end[0] - bend, end[1]];
+    path += ` C${c1} ${c2} ${end}`;
+    if (i + 2 < ways.length) path += ` L${out(ways[i + 1])}`;
+  }
+  const from = ways[0];
+  const to = ways.at(-1);
   return make("path", {
-    d: `M${start} C${c1} ${c2} ${end}`, class: remote ? "edge remote" : "edge",
+    d: path, class: from.host !== to.host ? "edge remote" : "edge",
     "marker-end": "url(#arrow)", "data-from": from.key, "data-to": to.key,
   });
 }
 
-function drawBox(box) {
+function drawBox(box, { width, text }) {
   const group = make("g", { class: `box ${box.kind}`, "data-level": box.level, "data-key": box.key });
   const full = make("title", {});
   full.textContent = `${box.kind} ${box.title} on ${box.host}${box.level ? `, ${box.level}` : ""}`;
-  const middle = box.x + kBoxWidth / 2;
+  const middle = box.x + width / 2;
   const title = make("text", { x: middle, y: box.y + 17, class: "title" });
-  title.textContent = shortened(box.title);
+  title.textContent = shortened(box.title, text);
   const host = make("text", { x: middle, y: box.y + 31, class: "at" });
   const state = box.level && box.level !== "live" && box.level !== "unknown" ? `, ${box.level}` : "";
-  host.textContent = `@${shortened(box.host)}${state}`;
-  group.append(full, make("rect", { x: box.x, y: box.y, width: kBoxWidth, height: kBoxHeight,
+  host.textContent = shortened(`@${box.host}${state}`, text);
+  group.append(full, make("rect", { x: box.x, y: box.y, width, height: kBoxHeight,
     rx: box.kind === "stream" ? kBoxHeight / 2 : 3 }), title, host);
   return group;
 }
 
-function shortened(text) {
-  return text.length > kMaxText ? `${text.slice(0, kMaxText - 1)}\u2026` : text;
+function shortened(text, most) {
+  return text.length > most ? `${text.slice(0, most - 1)}\u2026` : text;
 }
 
-function describe(boxes) {
-  const lines = [];
-  for (const box of boxes.values()) {
-    for (const to of box.to) lines.push(`${box.title} to ${boxes.get(to).title}`);
-  }
+function describe(arrows) {
+  const lines = arrows.map((ways) => `${ways[0].title} to ${ways.at(-1).title}`);
   return `Arrows: ${lines.join(", ") || "none"}`;
 }
 

@@ -9,7 +9,8 @@ import { Signals } from "./signals.js";
 import { Time, TimeBar } from "./time.js";
 import { Views } from "./views.js";
 
-const kOverviewMs = 1000;
+const kOverviewMs = 200; // the answer comes when there is a new state, about each second
+const kFailedMs = 1000;
 const kAtMs = 50;
 const kOpeningMs = 100;
 const kArrivingMs = 200; // the sample of a held instant is still on its way
@@ -42,7 +43,7 @@ class Types {
     if (entry && (entry.type || performance.now() - entry.failedAt < kTypeRetryMs)) return entry.promise;
     const made = { type: null, failedAt: Infinity, incarnation: incarnationOf(stream) };
     this.known.set(stream, made);
-    made.promise = connection.request("type", { stream }).then(
+    made.promise = this.request(stream).then(
       (answer) => (made.type = { fields: answer.fields ?? [], payload_bytes: answer.payload_bytes, name: answer.name }),
       (error) => {
         if (!(error instanceof RequestError || error instanceof LostError)) throw error;
@@ -50,6 +51,14 @@ class Types {
         return null;
       });
     return made.promise;
+  }
+
+  async request(stream) {
+    for (;;) {
+      const answer = await connection.request("type", { stream });
+      if (answer.status !== "opening") return answer;
+      await new Promise((resolve) => setTimeout(resolve, kOpeningMs));
+    }
   }
 
   forgetRecreated() {
@@ -61,7 +70,7 @@ class Types {
 }
 
 function incarnationOf(stream) {
-  return streams().find((one) => one.id_text === stream)?.incarnation ?? null;
+  return streams().find((one) => one.stream === stream)?.incarnation ?? null;
 }
 
 function streams() {
@@ -122,8 +131,7 @@ for (const [i, button] of tabs.entries()) {
 
 const overviewPump = new Pump(connection, kOverviewMs, async () => {
   const first = overview === null;
-  overview = await connection.request("overview");
-  time.setNow(BigInt(overview.now_ns));
+  overview = complete(await connection.request("overview"));
   const range = overview.range && { oldest: BigInt(overview.range.oldest_ns), newest: BigInt(overview.range.newest_ns) };
   time.setRange(range, overview.recording !== null);
   types.forgetRecreated();
@@ -137,6 +145,14 @@ const overviewPump = new Pump(connection, kOverviewMs, async () => {
   return 0;
 });
 
+// The first answer may come before all is known.
+function complete(answer) {
+  for (const list of ["hosts", "streams", "nodes", "findings", "events"]) answer[list] ??= [];
+  answer.range ??= null;
+  answer.recording ??= null;
+  return answer;
+}
+
 // The samples of all that is visible, at one instant, with one request.
 const atPump = new Pump(connection, kAtMs, async () => {
   const shown = page();
@@ -148,26 +164,34 @@ const atPump = new Pump(connection, kAtMs, async () => {
     answer = await connection.request("at", { streams: wanted, t_ns: t === null ? null : String(t), payloads: true });
   } catch (error) {
     if (!(error instanceof RequestError)) throw error;
-    shown.showSamples(t ?? time.now(), new Map(wanted.map((stream) => [stream, failed(error.message)])));
-    return kOverviewMs;
+    shown.showSamples(t ?? 0n, new Map(wanted.map((stream) => [stream, failed(error.message)])));
+    return kFailedMs;
   }
-  const at = BigInt(answer.head.t_ns);
   const samples = new Map(answer.head.samples.map((one) => [one.stream, sampleOf(one, answer)]));
+  const at = t ?? newestOf(samples); // the newest of each is shown as of the newest of all
   if (shown === page()) {
     shown.showSamples(at, samples);
-    time.setShown(at);
+    if (at !== null) time.setShown(at);
   }
   const has = (status) => answer.head.samples.some((one) => one.status === status);
-  if (has("opening")) return kOpeningMs;
+  if (has("opening") || has("restarted")) return kOpeningMs;
   if (time.mode !== "hold" && time.hover === null) return 0;
-  return has("arriving") || has("not yet") ? kArrivingMs : null;
+  return has("arriving") || has("not_yet") ? kArrivingMs : null;
 });
 time.addEventListener("change", () => atPump.wake());
+
+function newestOf(samples) {
+  let newest = null;
+  for (const { timeNs } of samples.values()) {
+    if (timeNs !== null && (newest === null || timeNs > newest)) newest = timeNs;
+  }
+  return newest;
+}
 
 function sampleOf(one, answer) {
   const has = one.payload_at !== undefined && one.payload_at !== null;
   return {
-    status: one.status,
+    status: one.status.replaceAll("_", " "),
     error: one.error ?? "",
     tid: one.tid ?? null,
     timeNs: one.time_ns === undefined || one.time_ns === null ? null : BigInt(one.time_ns),
@@ -186,8 +210,8 @@ function failed(error) {
 async function step(count) {
   time.hover = null;
   const stream = views.root.hidden ? signals.chosenStreams()[0] : views.stepStream();
-  const start = time.t ?? time.shown ?? time.now();
-  if (stepping) return;
+  const start = time.t ?? time.shown;
+  if (stepping || start === null) return;
   stepping = true;
   time.hold(start);
   try {
@@ -216,7 +240,7 @@ async function neighbour(stream, t, direction) {
   if (!here) return null;
   if (direction < 0) return (await at(here.ns - 1n))?.ns ?? null;
   // Ahead by a cycle, then by more; and back, should that skip samples.
-  const cycle = streams().find((one) => one.id_text === stream)?.cycle_ns;
+  const cycle = streams().find((one) => one.stream === stream)?.cycle_ns;
   let ahead = cycle > 0 ? BigInt(cycle) : 10000000n;
   let next = null;
   for (let i = 0; i < kMaxSteps && !next; ++i, ahead *= 2n) {

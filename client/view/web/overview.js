@@ -36,7 +36,7 @@ export class Overview {
 
   showHosts(hosts, limitNs) {
     setText(this.find("hosts-count"), String(hosts.length));
-    setText(this.find("clock-limit"), `limit ${duration(limitNs)}`);
+    setText(this.find("clock-limit"), `(limit ${duration(limitNs)})`);
     const key = (host) => host.host ?? host.id ?? host.addresses.join(" ");
     syncChildren(this.find("hosts").tBodies[0], hosts, key, makeHost, (row, host) => {
       const [name, state, trip, streams, bound, address, note] = row.cells;
@@ -61,11 +61,11 @@ export class Overview {
     this.find("no-streams").hidden = streams.length > 0;
     this.find("streams").hidden = streams.length === 0;
     const users = usersOf(nodes);
-    const key = (stream) => stream.id_text;
+    const key = (stream) => stream.stream;
     const make = (stream) => this.makeStream(stream);
     syncChildren(this.find("streams").tBodies[0], streams, key, make, (row, stream) => {
       const [name, state, hz, age, tid, held, lost, size, writers, readers] = row.cells;
-      row.dataset.stream = stream.id_text;
+      row.dataset.stream = stream.stream;
       row.dataset.state = stream.state ?? "unknown";
       name.title = stream.type ?? "no type";
       setState(state, stream.state ?? kUnknown, streamLevel(stream.state));
@@ -78,7 +78,7 @@ export class Overview {
       lost.title = losses.title;
       lost.classList.toggle("bad", losses.bad);
       setText(size, bytes(stream.payload_bytes));
-      const used = users.get(stream.id_text) ?? { writers: [], readers: [] };
+      const used = users.get(stream.stream) ?? { writers: [], readers: [] };
       showUsers(writers, used.writers, sum(stream.writers, stream.remote_writers));
       showUsers(readers, used.readers, sum(stream.readers, stream.remote_readers));
     });
@@ -87,7 +87,7 @@ export class Overview {
   makeStream(stream) {
     const row = element("tr", { tabindex: "-1" });
     const label = stream.id === 0 ? stream.name : `${stream.name}:${stream.id}`;
-    const open = () => this.open(stream.id_text);
+    const open = () => this.open(stream.stream);
     const link = element("button", { class: "link", title: "Show it in a view", onclick: open }, label);
     row.append(element("th", { scope: "row" }, link, element("span", { class: "at" }, `@${stream.host}`)));
     const labels = ["State", "Rate", "Age", "Newest tid", "Held", "Lost", "Sample", "Writers", "Readers"];
@@ -111,7 +111,7 @@ export class Overview {
     syncChildren(this.find("findings"), bad, key, makeFinding, updateFinding);
     const details = this.find("findings-ok");
     details.hidden = good.length === 0;
-    setText(details.querySelector("summary"), `${good.length} checks found nothing`);
+    setText(details.querySelector("summary"), `${good.length} checks are ok`);
     syncChildren(details.querySelector("ul"), good, key, makeFinding, updateFinding);
   }
 
@@ -136,7 +136,7 @@ export class Overview {
     const { streams, nodes } = this.answer;
     const inGraph = {
       width: box.clientWidth,
-      streams: streams.map((stream) => [stream.id_text, stream.name, stream.id, stream.host, stream.state]),
+      streams: streams.map((stream) => [stream.stream, stream.name, stream.id, stream.host, stream.state]),
       nodes: nodes.filter((node) => node.program !== null || node.pid !== null),
     };
     const text = JSON.stringify(inGraph);
@@ -219,8 +219,8 @@ function showUsers(cell, nodes, count) {
 
 function heldText(stream) {
   if (stream.oldest_ns === null || stream.oldest_ns === undefined) return kUnknown;
-  const ns = (stream.newest_time_ns ?? 0) - Number(stream.oldest_ns);
-  return ns > 0 ? duration(ns) : "1 sample";
+  const ns = BigInt(stream.newest_ns) - BigInt(stream.oldest_ns);
+  return ns > 0n ? duration(ns) : "1 sample";
 }
 
 // Only a mirror on this host can lose samples; without one there is nothing to count.

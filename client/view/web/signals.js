@@ -4,19 +4,21 @@
 // its script). The curves of each stream come with one `signals` request; the values at the cursor
 // come with the page's one `at` request, so that they are those of the exact samples.
 import { Pump, RequestError } from "./connection.js";
-import { findField, isFloat, signalsOf, valueOf } from "./fields.js";
-import { cssColor, download, duration, element, number, setText, timeOfDay } from "./format.js";
+import { findField, guessKind, isFloat, signalsOf, valueOf } from "./fields.js";
+import { cssColor, download, duration, element, number, setText, timeOfDay, wholeDuration } from "./format.js";
 
 const kPeriodMs = 100;
 const kOpeningMs = 100;
 const kPoints = 800;
-const kExportPoints = 200000;
+const kExportPoints = 20000; // the most that is answered
 const kSpans = [1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1800, 3600]; // seconds
 const kDefaultSpan = 10;
+const kFewPanels = 2;
 const kFewFields = 3; // shown before a person has chosen
 const kColors = 8;
 const kPlotHeight = 220;
 const kNarrowHeight = 170;
+const kLabelPx = 80; // of the clock error beside the cursor
 const kDragPx = 4; // a shorter way of the pointer is a click
 const kMinZoomNs = 1000n;
 
@@ -53,7 +55,7 @@ export class Signals extends EventTarget {
   makeTools() {
     const find = (id) => this.root.querySelector(`#${id}`);
     this.spans = find("span");
-    for (const span of kSpans) this.spans.add(new Option(duration(span * 1e9), span));
+    for (const span of kSpans) this.spans.add(new Option(wholeDuration(span), span));
     this.spans.value = this.span;
     this.spans.addEventListener("change", () => {
       this.span = Number(this.spans.value);
@@ -90,19 +92,19 @@ export class Signals extends EventTarget {
 
   // Until a person has chosen: a panel with a few fields of each of the first streams.
   async suggest() {
-    if (this.panels.length > 0 || this.suggested) return;
+    if (this.panels.length > 0 || this.suggested || this.streams().length === 0) return;
     this.suggested = true;
-    for (const stream of this.streams()) {
-      const type = await this.types.ask(stream.id_text);
+    const known = [];
+    for (const { stream } of this.streams()) {
+      const type = await this.types.ask(stream);
       const names = type ? signalsOf(type).filter((one) => !one.count).slice(0, kFewFields) : [];
-      if (names.length === 0) continue;
-      this.addPanel(names.map((one) => ({ stream: stream.id_text, field: one.name })));
-      if (this.panels.length === 2) break;
+      if (names.length > 0) known.push({ stream, names, isArray: ["scan", "image"].includes(guessKind(type)) });
     }
-    if (this.panels.length === 0) {
-      this.suggested = false;
-      this.addPanel([]);
+    known.sort((a, b) => Number(a.isArray) - Number(b.isArray));
+    for (const { stream, names } of known.slice(0, kFewPanels)) {
+      this.addPanel(names.map(({ name }) => ({ stream, field: name })));
     }
+    if (this.panels.length === 0) this.addPanel([]);
     this.wakeAll();
   }
 
@@ -194,7 +196,7 @@ export class Signals extends EventTarget {
     });
     const options = {
       ...this.plotSize(),
-      padding: [8, 12, 0, 0],
+      padding: [8, 30, 0, 0],
       legend: { show: false },
       scales: { x: { time: false, range: () => this.windowX() } },
       axes: [
@@ -204,11 +206,14 @@ export class Signals extends EventTarget {
       ],
       cursor: { x: false, y: false, points: { show: false }, drag: { x: true, y: false, setScale: false } },
       series: [{}, ...series],
-      hooks: { setSelect: [(plot) => this.onSelect(plot)] },
+      // The place of the cursor is known when the plot has its new scale.
+      hooks: { setSelect: [(plot) => this.onSelect(plot)], draw: [() => this.drawCursorIn(panel)] },
     };
+    panel.line = null; // the new plot draws at once
     panel.plot = new uPlot(options, [[], ...panel.signals.map(() => [])], panel.plotBox);
     panel.band = element("div", { class: "cursor-band", hidden: true });
-    panel.line = element("div", { class: "cursor-line", hidden: true });
+    panel.line = element("div", { class: "cursor-line", hidden: true },
+      element("span", { title: "Bound on the error of the samples' times" }));
     panel.plot.over.append(panel.band, panel.line);
     this.listen(panel);
   }
@@ -272,6 +277,7 @@ export class Signals extends EventTarget {
   }
 
   tick(x, step) {
+    if (this.epoch === null) return "";
     const places = step >= 1 ? 0 : Math.min(9, Math.ceil(-Math.log10(step) - 1e-9));
     return timeOfDay(this.toTime(x), places);
   }
@@ -329,7 +335,7 @@ export class Signals extends EventTarget {
       if (!type) continue;
       const answer = await this.askStream(stream, type, live, kPoints);
       opening ||= answer.status === "opening";
-      if (newest === null || answer.to > newest) newest = answer.to;
+      if (answer.to && (newest === null || answer.to > newest)) newest = answer.to;
     }
     if (live && this.time.mode === "live" && newest !== null) {
       this.window = { from: newest - this.spanNs(), to: newest };
@@ -345,9 +351,10 @@ export class Signals extends EventTarget {
     const names = [...new Set(all.filter((one) => one.stream === stream).map((one) => one.field))];
     const fields = names.filter((name) => findField(type, name));
     if (!live && !this.window) this.keepInWindow();
-    const from = live ? this.time.now() - this.spanNs() : this.window.from;
-    const to = live ? null : this.window.to;
-    const answer = { status: "ok", error: "", from, to: to ?? this.time.now(), curves: new Map() };
+    if (!live && !this.window) return { status: "ok", curves: new Map() };
+    const span = live ? { span_ns: String(this.spanNs()) }
+      : { from_ns: String(this.window.from), to_ns: String(this.window.to) };
+    const answer = { status: "ok", error: "", from: this.window?.from ?? null, to: null, curves: new Map() };
     this.answers.set(stream, answer);
     if (fields.length === 0) {
       answer.error = `'${stream}' has no field '${names[0]}'`;
@@ -355,7 +362,7 @@ export class Signals extends EventTarget {
     }
     try {
       const binary = await this.connection.request("signals", {
-        stream, fields, from_ns: String(from), to_ns: to === null ? null : String(to), points });
+        stream, fields, ...span, points });
       const { head } = binary;
       Object.assign(answer, { status: head.status, error: head.error ?? "", lost: head.lost ?? 0,
         count: head.samples ?? 0, clockErrorS: head.clock_error_s ?? null });
@@ -402,7 +409,7 @@ export class Signals extends EventTarget {
       if (!answer) continue;
       if (answer.status !== "ok") notes.push(`${stream}: ${answer.error || answer.status}`);
       else if (answer.error) notes.push(answer.error);
-      else if (answer.count === 0) notes.push(`${stream}: no samples in this window`);
+      else if ([...answer.curves.values()].every((curve) => curve.times.length === 0)) notes.push(`${stream}: no samples in this window`);
       if (answer.lost > 0) notes.push(`${stream}: ${answer.lost} samples lost in this window`);
     }
     return notes.join("; ");
@@ -411,7 +418,6 @@ export class Signals extends EventTarget {
   // The samples at the shown instant, from the page's `at` request.
   showSamples(t, samples) {
     this.samples = samples;
-    this.cursorT = t;
     this.drawCursor();
     this.showValues();
   }
@@ -435,25 +441,28 @@ export class Signals extends EventTarget {
 
   // The instant in all panels, with the clock error of the panel's samples around it.
   drawCursor() {
-    const t = this.time.hover ?? this.time.t ?? this.cursorT;
-    for (const panel of this.panels) {
-      if (!panel.plot || this.epoch === null) continue;
-      const inside = t !== undefined && t !== null && this.window && t >= this.window.from && t <= this.window.to;
-      panel.line.hidden = !inside;
-      panel.band.hidden = !inside;
-      if (!inside) continue;
-      const x = this.toX(t);
-      panel.line.style.left = `${panel.plot.valToPos(x, "x")}px`;
-      const error = this.clockErrorOf(panel);
-      panel.band.hidden = error === null;
-      if (error === null) continue;
-      const left = panel.plot.valToPos(x - error, "x");
-      const right = panel.plot.valToPos(x + error, "x");
-      panel.band.style.left = `${left}px`;
-      panel.band.style.width = `${right - left}px`;
-      panel.band.title = `Clock error \u00b1${duration(error * 1e9)}`;
-      panel.element.dataset.clockErrorNs = String(Math.round(error * 1e9));
-    }
+    for (const panel of this.panels) this.drawCursorIn(panel);
+  }
+
+  drawCursorIn(panel) {
+    const { plot, line, band } = panel;
+    const t = this.time.instant();
+    if (!line || this.epoch === null) return;
+    const error = this.clockErrorOf(panel);
+    panel.element.dataset.clockErrorNs = error === null ? "" : String(Math.round(error * 1e9));
+    const inside = t !== null && this.window && t >= this.window.from && t <= this.window.to;
+    line.hidden = !inside;
+    band.hidden = !inside || error === null;
+    if (!inside) return;
+    const x = this.toX(t);
+    line.style.left = `${plot.valToPos(x, "x")}px`;
+    setText(line.firstElementChild, error ? `\u00b1${duration(error * 1e9)}` : "");
+    line.classList.toggle("left", plot.valToPos(x, "x") > plot.over.clientWidth - kLabelPx);
+    if (error === null) return;
+    const left = plot.valToPos(x - error, "x");
+    const right = plot.valToPos(x + error, "x");
+    band.style.left = `${left}px`;
+    band.style.width = `${right - left}px`;
   }
 
   clockErrorOf(panel) {
@@ -568,7 +577,7 @@ class Picker {
     this.list.replaceChildren();
     if (!this.dialog.open) this.dialog.showModal();
     this.filter.focus();
-    await Promise.all(this.signals.streams().map((stream) => this.signals.types.ask(stream.id_text)));
+    await Promise.all(this.signals.streams().map((stream) => this.signals.types.ask(stream.stream)));
     this.show();
   }
 
@@ -577,12 +586,12 @@ class Picker {
     const fits = (text) => words.every((word) => text.toLowerCase().includes(word));
     const groups = [];
     for (const stream of this.signals.streams()) {
-      const type = this.signals.types.get(stream.id_text);
+      const type = this.signals.types.get(stream.stream);
       if (!type) continue;
-      const all = signalsOf(type).filter((one) => fits(`${stream.id_text} ${one.name}`));
+      const all = signalsOf(type).filter((one) => fits(`${stream.stream} ${one.name}`));
       if (all.length === 0 && (words.length > 0 || type.fields.length > 0)) continue;
-      groups.push(element("fieldset", {}, element("legend", {}, stream.id_text),
-        ...(all.length > 0 ? all.map((one) => this.entry(stream.id_text, one))
+      groups.push(element("fieldset", {}, element("legend", {}, stream.stream),
+        ...(all.length > 0 ? all.map((one) => this.entry(stream.stream, one))
           : [element("p", { class: "note" }, "Its type has no description, so its fields are not known.")])));
     }
     if (groups.length === 0) groups.push(element("p", { class: "empty" }, "Nothing fits."));

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The instant that the page shows: one for all plots and views. Times are BigInt, ns since 1970, of
-// the clock of dssm-view's host.
+// The instant that the page shows: one for all plots and views. Times are BigInt, ns since 1970.
+// Only times of samples are used: those of a recording that is played back are not the present.
 //
 //   live   the newest samples
 //   hold   the samples at `t`
@@ -24,22 +24,11 @@ export class Time extends EventTarget {
     this.range = null; // {oldest, newest}
     this.recording = false;
     this.speed = 1;
-    this.nowNs = 0n;
-    this.nowAt = 0;
   }
 
   // The instant to ask for; null: the newest.
   instant() {
     return this.hover ?? this.t;
-  }
-
-  now() {
-    return this.nowNs + BigInt(Math.round((performance.now() - this.nowAt) * 1e6));
-  }
-
-  setNow(ns) {
-    this.nowNs = ns;
-    this.nowAt = performance.now();
   }
 
   // What the rings hold, or the recording.
@@ -59,8 +48,8 @@ export class Time extends EventTarget {
   }
 
   // Holds `t`, or what is shown now.
-  hold(t = this.hover ?? this.shown ?? this.now()) {
-    this.set("hold", t);
+  hold(t = this.hover ?? this.shown ?? this.range?.newest ?? null) {
+    if (t !== null) this.set("hold", t);
   }
 
   play() {
@@ -146,6 +135,7 @@ export class TimeBar {
   update() {
     const { time } = this;
     this.root.dataset.mode = time.mode;
+    this.root.dataset.tNs = time.t ?? "";
     this.live.hidden = this.hold.hidden = time.recording;
     this.play.hidden = this.speedLabel.hidden = !time.recording;
     this.live.setAttribute("aria-pressed", String(time.mode === "live"));
@@ -157,7 +147,7 @@ export class TimeBar {
     const shown = time.shown;
     if (shown === null) return;
     this.shown.dataset.tNs = String(shown);
-    const reference = time.recording ? time.range?.oldest : time.now();
+    const reference = time.recording ? time.range?.oldest : time.range?.newest;
     const distance = reference === undefined ? 0n : shown - reference;
     const sign = distance < 0n ? "\u2212" : "+";
     const seconds = `${sign}${(Math.abs(Number(distance)) / 1e9).toFixed(3)} s`;
@@ -173,8 +163,9 @@ export class TimeBar {
     const t = this.time.t ?? end;
     this.slider.value = String(t - oldest);
     this.slider.setAttribute("aria-valuetext", timeOfDay(t));
-    setText(this.oldest, `${duration(end - oldest)}`);
-    this.oldest.title = `The rings hold samples from ${timeOfDay(oldest)} to ${timeOfDay(newest)}`;
-    if (this.time.recording) this.oldest.title = "The length of the recording";
+    const length = duration(end - oldest);
+    setText(this.oldest, this.time.recording ? length : `\u2212${length}`);
+    this.oldest.title = this.time.recording ? "The length of the recording"
+      : `The rings hold samples from ${timeOfDay(oldest)} to ${timeOfDay(newest)}`;
   }
 }

@@ -4,7 +4,7 @@
 // the kind of view that a person chose or that fits the type.
 import { Pump, RequestError } from "./connection.js";
 import { guessKind, imageOf, poseOf, scanOf } from "./fields.js";
-import { duration, element, setText, timeOfDay } from "./format.js";
+import { duration, element, setText, timeOfDay, wholeDuration } from "./format.js";
 import { HexView, ImageView, PlaneView, TableView } from "./drawings.js";
 
 const kSuggested = 6; // cards that are shown before a person has chosen
@@ -63,8 +63,8 @@ export class Views extends EventTarget {
     const order = ["scan", "pose", "image", "table", "hex"];
     const kinds = new Map();
     for (const stream of streams) {
-      const type = await this.types.ask(stream.id_text);
-      kinds.set(stream.id_text, type ? guessKind(type) : "hex");
+      const type = await this.types.ask(stream.stream);
+      kinds.set(stream.stream, type ? guessKind(type) : "hex");
     }
     const sorted = [...kinds].sort(([, a], [, b]) => order.indexOf(a) - order.indexOf(b));
     for (const [stream] of sorted.slice(0, kSuggested)) this.add({ stream });
@@ -98,7 +98,7 @@ export class Views extends EventTarget {
   }
 
   showStreams() {
-    const names = this.streams().map((stream) => stream.id_text);
+    const names = this.streams().map((stream) => stream.stream);
     const key = JSON.stringify(names);
     if (key === this.names) return;
     this.names = key;
@@ -166,7 +166,7 @@ class Card {
       changed();
     } });
     for (const span of kTrailSpans) {
-      const text = span === 0 ? "none" : duration(span * 1e9);
+      const text = span === 0 ? "none" : wholeDuration(span);
       this.trailBox.add(new Option(text, span, span === this.trailS, span === this.trailS));
     }
     this.trailLabel = element("label", { hidden: true }, "trail ", this.trailBox);
@@ -197,7 +197,7 @@ class Card {
       this.rebuild();
     }
     if (type && scanOf(type)) {
-      for (const stream of this.views.streams()) await this.views.types.ask(stream.id_text);
+      for (const stream of this.views.streams()) await this.views.types.ask(stream.stream);
       this.showPlaces();
     }
   }
@@ -211,7 +211,7 @@ class Card {
     this.drawing = null;
     if (!this.type) return;
     const guessed = guessKind(this.type);
-    this.kindBox.replaceChildren(new Option(`${kKinds[guessed]} (fits)`, ""),
+    this.kindBox.replaceChildren(new Option(`Auto: ${kKinds[guessed]}`, ""),
       ...this.possibleKinds().filter((kind) => kind !== guessed).map((kind) => new Option(kKinds[kind], kind)));
     if (this.kind === guessed) this.kind = null;
     this.kindBox.value = this.kind ?? "";
@@ -243,7 +243,7 @@ class Card {
   }
 
   showPlaces() {
-    const poses = this.views.streams().map((stream) => stream.id_text).filter((stream) => {
+    const poses = this.views.streams().map((stream) => stream.stream).filter((stream) => {
       const type = this.views.types.get(stream);
       return type && poseOf(type)?.theta;
     });
@@ -315,7 +315,8 @@ class Card {
     if (none) setText(this.note, sample.error || sample.status);
     setText(foot.tid, sample.tid === null ? sample.status : `tid ${sample.tid}`);
     setText(foot.time, sample.timeNs === null ? "" : timeOfDay(sample.timeNs));
-    setText(foot.age, sample.timeNs === null ? "" : `${duration(t - sample.timeNs)} before`);
+    const age = sample.timeNs === null ? 0n : t - sample.timeNs;
+    setText(foot.age, age === 0n ? "" : `${duration(age)} before`);
     foot.age.title = "Before the shown instant";
     setText(foot.error, sample.clockErrorNs === null ? "" : `\u00b1${duration(sample.clockErrorNs)}`);
   }
@@ -339,14 +340,16 @@ class Card {
     const pose = type && poseOf(type);
     if (!pose || this.trailS === 0) return false;
     const { time } = this.views;
-    const to = time.t ?? time.now();
-    const from = to - BigInt(this.trailS) * 1000000000n;
+    const spanNs = BigInt(this.trailS) * 1000000000n;
+    const span = time.t === null ? { span_ns: String(spanNs) }
+      : { from_ns: String(time.t - spanNs), to_ns: String(time.t + 1n) };
     try {
       const answer = await this.views.connection.request("signals", { stream, fields: [pose.x.name, pose.y.name],
-        from_ns: String(from), to_ns: String(to), points: kTrailPoints });
+        ...span, points: kTrailPoints });
       if (answer.head.status === "opening") return true;
       const [x, y] = answer.head.curves ?? [];
       if (!x || !y) return false;
+      const from = BigInt(answer.head.from_ns ?? span.from_ns);
       this.trail = joinTrail(from, answer.doubles(x.times_at, x.points), answer.doubles(x.values_at, x.points),
         answer.doubles(y.times_at, y.points), answer.doubles(y.values_at, y.points));
       if (this.samples) this.show(this.t, this.samples);

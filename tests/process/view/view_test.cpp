@@ -4,7 +4,7 @@
 // http.client and websockets (client.py), and Foxglove's own library (foxglove/client.cjs).
 #include <fstream>
 
-#include "tests/process/dssmctl/fleet_test.hpp"
+#include "tests/process/view/view_fixture.hpp"
 #include "tests/support/samples.hpp"
 
 namespace dssm::test {
@@ -17,27 +17,8 @@ struct Motion {
 };
 DSSM_DESCRIBE(Motion, x, speed, wheel)
 
-std::string source(const std::string& path) {
-  const char* root = std::getenv("DSSM_SOURCE_ROOT");  // NOLINT(concurrency-mt-unsafe)
-  return std::string(root == nullptr ? "." : root) + "/" + path;
-}
-
-std::vector<std::string> view_argv(std::vector<std::string> words) {
-  std::vector<std::string> argv = {built("client/view/dssm-view"), "--pages",
-                                   source("client/view/web")};
-  argv.insert(argv.end(), words.begin(), words.end());
-  return argv;
-}
-
-class View : public FleetTest {
+class View : public ViewTest {
  protected:
-  View() {
-    const std::string line = view_.line();
-    const std::size_t at = line.find("http://");
-    EXPECT_NE(at, std::string::npos) << line;
-    if (at != std::string::npos) url_ = line.substr(at);
-  }
-
   std::string websocket_url() const { return "ws" + url_.substr(4); }
 
   // What client.py prints, line by line.
@@ -72,9 +53,6 @@ class View : public FleetTest {
     EXPECT_EQ(finished.exit_status, 0) << finished.err;
     return {std::atoi(finished.out.c_str()), finished.out};
   }
-
-  Running view_{view_argv({"--listen", "127.0.0.1:0"}), environment()};
-  std::string url_;
 };
 
 // --- the server

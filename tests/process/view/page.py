@@ -1,0 +1,319 @@
+#!/usr/bin/python3
+# SPDX-License-Identifier: Apache-2.0
+#
+# Checks the page of dssm-view in a browser: Debian's Chromium without a window, driven by selenium.
+#
+#   page.py CHECK URL FOLDER [ARGUMENT...]
+#
+# CHECK is the name of a function below, which says what its arguments are. Screenshots are written to
+# FOLDER. Prints lines for the test that runs it, and "ok" at the end; otherwise what went wrong, with
+# exit status 1. The page must not report an error in the browser's console in any check.
+import json
+import os
+import sys
+import tempfile
+import time
+import urllib.parse
+
+os.environ["SE_OFFLINE"] = "true"  # selenium must not download a driver
+
+from selenium import webdriver
+from selenium.common.exceptions import StaleElementReferenceException
+from selenium.webdriver.chrome.options import Options
+from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+
+BROWSER = "/usr/bin/chromium"
+DRIVER = "/usr/bin/chromedriver"
+TIMEOUT_S = 120  # only a page that hangs takes that long
+POLL_S = 0.02
+DESKTOP = (1280, 900)
+PHONE = (360, 740)
+
+
+class Page:
+    def __init__(self, url, folder, profile):
+        self.url, self.folder = url, folder
+        self.may_report = []  # parts of messages in the console that belong to the check
+        options = Options()
+        options.binary_location = BROWSER
+        for argument in [
+            "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-background-networking",
+            "--no-first-run", "--hide-scrollbars", "--user-data-dir=" + profile,
+        ]:
+            options.add_argument(argument)
+        options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+        self.driver = webdriver.Chrome(service=Service(DRIVER), options=options)
+        self.driver.set_page_load_timeout(TIMEOUT_S)
+        self.driver.set_script_timeout(TIMEOUT_S)
+        self.show_as(DESKTOP, "light")
+
+    def show_as(self, size, scheme):
+        width, height = size
+        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", {
+            "width": width, "height": height, "deviceScaleFactor": 1, "mobile": size == PHONE})
+        self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {
+            "features": [{"name": "prefers-color-scheme", "value": scheme}]})
+
+    def open(self, tab, **state):
+        """Loads the page with `tab`; `state`: "signals" and "views" of the fragment."""
+        fragment = {"tab": tab} | {key: json.dumps(value) for key, value in state.items()}
+        self.driver.get("about:blank")  # otherwise only the fragment would change
+        self.driver.get(self.url + "#" + urllib.parse.urlencode(fragment))
+        self.await_connected()
+
+    def await_connected(self):
+        self.wait("the page is connected", lambda: self.get("#connection", "data-state") == "connected")
+
+    def all(self, selector):
+        return self.driver.find_elements(By.CSS_SELECTOR, selector)
+
+    def one(self, selector):
+        found = self.all(selector)
+        assert len(found) == 1, f"there are {len(found)} elements '{selector}'"
+        return found[0]
+
+    def get(self, selector, attribute):
+        return self.one(selector).get_attribute(attribute)
+
+    def run(self, script, *arguments):
+        return self.driver.execute_script(script, *arguments)
+
+    def press(self, *keys):
+        ActionChains(self.driver).send_keys(*keys).perform()
+
+    def wait(self, what, condition):
+        """Until `condition` gives something, which it returns."""
+        end = time.monotonic() + TIMEOUT_S
+        while time.monotonic() < end:
+            try:
+                result = condition()
+            except (AssertionError, StaleElementReferenceException):  # elements still change
+                result = None
+            if result:
+                return result
+            time.sleep(POLL_S)
+        self.shot("failed")
+        raise AssertionError(f"not so within {TIMEOUT_S} s: {what}\n{self.one('body').text}")
+
+    def shot(self, name):
+        assert self.driver.save_screenshot(os.path.join(self.folder, name + ".png"))
+
+    def close(self):
+        try:
+            return [entry["message"] for entry in self.driver.get_log("browser")
+                    if not any(part in entry["message"] for part in self.may_report)]
+        finally:
+            self.driver.quit()
+
+
+def say(*words):
+    print(*words, flush=True)
+
+
+def stream_row(stream):
+    return f"#streams tr[data-stream='{stream}']"
+
+
+def card(stream):
+    return f"#cards .card[data-stream='{stream}']"
+
+
+# --- checks -----------------------------------------------------------------------------------------
+
+
+def overview(page, program, *streams):
+    """Hosts and `streams` are shown; `program`, which writes to one of them, as text."""
+    page.open("overview")
+    for host in ["pc1", "pc2", "pc3"]:
+        page.wait(host, lambda: page.get(f"#hosts tr[data-host='{host}']", "data-state") in ["self", "up"])
+    for stream in streams:
+        page.wait(stream, lambda: page.one(stream_row(stream)))
+    page.wait("the writer", lambda: program in page.one("#streams").text)
+    page.wait("the writer's box", lambda: page.all("#graph .program"))
+    titles = page.run("return [...document.querySelectorAll('#graph title')].map(e => e.textContent)")
+    assert any(program in title for title in titles), titles
+    assert not page.all("#overview img"), "a name was taken for markup"
+    assert page.all("#graph path.edge"), "the graph has no arrow"
+    assert page.one("#findings-group").text.count("\n") > 0, "no findings of doctor"
+    page.shot("overview-light")
+    first_ms = page.run("return performance.getEntriesByName('first-contentful-paint')[0]?.startTime")
+    say("first paint after", first_ms, "ms")
+    page.show_as(DESKTOP, "dark")
+    page.wait("dark", lambda: page.run("return document.documentElement.dataset.theme") == "dark")
+    page.shot("overview-dark")
+
+
+def signal(page, stream, field):
+    """The curve of a field follows its stream, and stands still while held."""
+    page.open("signals", signals={"span": 10, "panels": [[[stream, field]]]})
+    legend = f"[data-signal='{stream} {field}']"
+
+    def shown():
+        return int(page.get(legend, "data-tid") or -1)
+
+    def newest():
+        text = page.run("return arguments[0].cells[4].textContent", page.one(stream_row(stream)))
+        return int(text) if text.isdigit() else -1
+
+    first = page.wait("a value", lambda: shown() > 0 and shown())
+    page.wait("the value follows", lambda: shown() > first + 20)
+    page.wait("a curve", lambda: int(page.get(".panel", "data-points") or 0) > 20)
+    page.press(" ")
+    page.wait("held", lambda: page.get("#time", "data-mode") == "hold")
+    t = page.wait("the held instant", lambda: page.get("#shown-t", "data-t-ns"))
+    held = page.wait("settled", lambda: page.get("#shown-t", "data-t-ns") == t and shown())
+    before = newest()
+    page.wait("the stream goes on", lambda: newest() > max(before, held) + 20)
+    assert shown() == held, f"held {held}, but {shown()} is shown"
+    page.shot("signals-light")
+    page.press("l")
+    page.wait("live again", lambda: shown() > held + 20)
+    page.show_as(DESKTOP, "dark")
+    page.wait("dark", lambda: page.run("return document.documentElement.dataset.theme") == "dark")
+    page.shot("signals-dark")
+
+
+def slider(page, *streams):
+    """Prints for places of the slider the shown time [ns] and the shown tid of each of `streams`."""
+    page.open("views", views=[{"stream": stream} for stream in streams])
+
+    def tids():
+        return [page.get(card(stream), "data-tid") for stream in streams]
+
+    page.wait("samples", lambda: all(tids()))
+    for part in [0.3, 0.55, 0.8, 0.9]:
+        page.run("const slider = document.getElementById('slider');"
+                 "slider.value = Math.round(arguments[0] * Number(slider.max));"
+                 "slider.dispatchEvent(new Event('input'))", part)
+        page.wait("held", lambda: page.get("#time", "data-mode") == "hold")
+        say("at", settled(page, streams), *tids())
+    before = tids()
+    page.press(Keys.ARROW_LEFT)
+    page.wait("a step back", lambda: int(tids()[0]) == int(before[0]) - 1)
+    say("at", settled(page, streams), *tids())
+    page.press(Keys.ARROW_RIGHT)
+    page.wait("a step on", lambda: tids()[0] == before[0])
+    say("at", settled(page, streams), *tids())
+
+
+def settled(page, streams):
+    """Waits until the views show the held instant; returns it."""
+    def held():
+        t = page.get("#time", "data-t-ns")
+        ok = all(page.get(card(stream), "data-status") == "ok" for stream in streams)
+        return ok and t == page.get("#shown-t", "data-t-ns") and t
+    return page.wait("the views show the instant", held)
+
+
+def link(page, stream, *fields):
+    """What is chosen is in the URL: a reload shows the same."""
+    panels = [[[stream, fields[0]], [stream, fields[1]]], [[stream, fields[2]]]]
+    page.open("signals", signals={"span": 60, "panels": panels})
+
+    def names():
+        return [item.get_attribute("data-signal") for item in page.all(".legend li")]
+
+    wanted = [f"{stream} {field}" for field in fields]
+    page.wait("the chosen signals", lambda: names() == wanted and len(page.all(".panel")) == 2)
+    assert page.get("#span", "value") == "60"
+    page.one(f"[data-signal='{wanted[0]}'] button").click()
+    page.wait("one was removed", lambda: names() == wanted[1:])
+    page.wait("it is not in the URL", lambda: urllib.parse.quote(f'"{fields[0]}"') not in page.driver.current_url)
+    page.driver.refresh()
+    page.await_connected()
+    page.wait("the same after a reload", lambda: names() == wanted[1:])
+    assert page.get("#span", "value") == "60"
+    # A link that was cut off or changed shows what it can.
+    page.open("signals", signals=[1, {"panels": 5}], views={"a": "b"})
+    page.driver.get(page.url + "#tab=nothing&signals=%7B&views=%5B%7B%7D%2C5%5D&t=abc")
+    page.wait("the overview", lambda: page.one("#overview").is_displayed())
+
+
+def views(page, scan, pose, image, raw):
+    """Each type gets the view that fits, and it shows the sample."""
+    page.may_report = ["willReadFrequently"]  # this check reads pixels
+    page.open("views")
+    for stream, kind in [(scan, "scan"), (pose, "pose"), (image, "image"), (raw, "hex")]:
+        page.wait(f"{stream} as {kind}", lambda: page.get(card(stream), "data-kind") == kind)
+    pixel = ("const c = arguments[0]; return c.width !== 160 ? null :"
+             " [...c.getContext('2d').getImageData(40, 30, 1, 1).data]")
+    page.wait("the image", lambda: page.run(pixel, page.one(card(image) + " canvas")) == [70, 70, 70, 255])
+    drawn = ("const c = arguments[0], d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;"
+             " let n = 0; for (let i = 3; i < d.length; i += 4) n += d[i] > 200; return n > 100")
+    for stream in [scan, pose]:
+        page.wait(f"{stream} is drawn", lambda: page.run(drawn, page.one(card(stream) + " canvas")))
+    page.wait("bytes", lambda: "000000  de ad be ef" in page.one(card(raw)).text)
+    page.shot("views-light")
+    page.one(f"{card(scan)} select[aria-label^='Kind']").send_keys("Table")
+    page.wait("all fields", lambda: "first_rad" in page.one(card(scan)).text)
+    page.show_as(DESKTOP, "dark")
+    page.wait("dark", lambda: page.run("return document.documentElement.dataset.theme") == "dark")
+    page.shot("views-dark")
+
+
+def host_down(page, host):
+    """Prints "ready" when `host` is up, and ends when the page shows that it is down."""
+    page.open("overview")
+    row = f"#hosts tr[data-host='{host}']"
+    page.wait("up", lambda: page.get(row, "data-state") == "up")
+    say("ready")
+    page.wait("down", lambda: page.get(row, "data-state") == "down")
+    page.wait("the event", lambda: f"host {host} is down" in page.one("#events").text)
+    page.shot("host-down")
+
+
+def reconnect(page):
+    """Prints "ready", "lost" when the page shows that, and ends when it is connected again."""
+    page.may_report = ["WebSocket connection to"]
+    page.open("overview")
+    page.wait("hosts", lambda: page.all("#hosts tr[data-host='pc1']"))
+    say("ready")
+    page.wait("lost", lambda: page.get("#connection", "data-state") == "lost")
+    page.wait("a notice", lambda: "No connection to dssm-view" in page.one("#banner").text)
+    page.shot("lost")
+    say("lost")
+    page.await_connected()
+    page.wait("no notice", lambda: not page.one("#banner").is_displayed())
+    page.wait("it goes on", lambda: page.get("#hosts tr[data-host='pc2']", "data-state") == "up")
+
+
+def phone(page, stream):
+    """No page is wider than a phone."""
+    page.show_as(PHONE, "light")
+    for tab in ["overview", "signals", "views"]:
+        page.open(tab)
+        ready = {"overview": stream_row(stream), "signals": ".legend li", "views": ".card[data-kind]"}
+        page.wait(f"what {tab} shows", lambda: page.all(ready[tab]))
+        page.wait("the graph", lambda: tab != "overview" or page.all("#graph svg"))
+        page.shot(f"{tab}-phone")
+        width, window = page.run("return [document.documentElement.scrollWidth, innerWidth]")
+        assert width <= PHONE[0] == window, f"{tab}: {width} of {window} pixels wide"
+    page.press("?")
+    page.wait("the keys", lambda: page.one("#keys").is_displayed())
+    assert page.run("return document.documentElement.scrollWidth") <= PHONE[0]
+
+
+CHECKS = {check.__name__: check for check in
+          [overview, signal, slider, link, views, host_down, reconnect, phone]}
+
+
+def main(check, url, folder, *arguments):
+    os.makedirs(folder, exist_ok=True)
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+        page = Page(url, folder, profile)
+        try:
+            CHECKS[check](page, *arguments)
+        finally:
+            messages = page.close()
+    assert not messages, "in the browser's console: " + "\n".join(messages)
+    say("ok")
+
+
+if __name__ == "__main__":
+    try:
+        main(*sys.argv[1:])
+    except AssertionError as error:
+        sys.exit(f"page.py {sys.argv[1]}: {error}")

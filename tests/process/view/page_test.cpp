@@ -1,0 +1,172 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The page of dssm-view in a browser (page.py). Its screenshots are in the build folder, in
+// tests/process/view/page.
+#include <signal.h>
+
+#include <cmath>
+#include <optional>
+
+#include "tests/process/view/view_fixture.hpp"
+
+namespace dssm::test {
+namespace {
+
+struct Wheels {
+  double x;
+  float speed[2];
+  std::int32_t ticks;
+};
+DSSM_DESCRIBE(Wheels, x, speed, ticks)
+
+struct PlanarScan {
+  float first_rad, step_rad;
+  float range_m[64];
+};
+DSSM_DESCRIBE(PlanarScan, first_rad, step_rad, range_m)
+
+struct PlanarPose {
+  double x_m, y_m, theta_rad;
+};
+DSSM_DESCRIBE(PlanarPose, x_m, y_m, theta_rad)
+
+constexpr char kMotion[] = "motion:0@pc1";
+
+class ViewPage : public ViewTest {
+ protected:
+  // page.py in the background, for `check`.
+  std::vector<std::string> page_argv(const std::string& check,
+                                     std::vector<std::string> arguments) const {
+    std::vector<std::string> argv = {"/usr/bin/python3", source("tests/process/view/page.py"),
+                                     check, url_, built("tests/process/view/page")};
+    argv.insert(argv.end(), arguments.begin(), arguments.end());
+    return argv;
+  }
+
+  // All lines of `page` until its end; the last one is "ok". Calls `meanwhile` over and over.
+  template <class Meanwhile>
+  std::vector<std::string> lines(Running& page, Meanwhile meanwhile) {
+    std::vector<std::string> lines;
+    for (;;) {
+      std::string line = page.line(meanwhile);
+      if (line.empty()) break;
+      lines.push_back(std::move(line));
+      if (lines.back() == "ok") break;
+    }
+    std::string all;
+    for (const std::string& line : lines) all += line + "\n";
+    EXPECT_TRUE(!lines.empty() && lines.back() == "ok") << all << page.rest();
+    return lines;
+  }
+  void expect_ok(const std::string& check, std::vector<std::string> arguments) {
+    Running page(page_argv(check, std::move(arguments)), {});
+    lines(page, [] {});
+  }
+};
+
+TEST_F(ViewPage, ShowsHostsStreamsAndProgramsWhateverTheirNamesAre) {
+  const std::string program = "<img src=x onerror=alert(1)>";
+  Session other =
+      Session::connect({.socket_path = daemon_.socket_path(), .program = program}).value();
+  auto motion = other.create<Wheels>("motion", depth_of(8)).value();
+  motion.write({});
+  auto lidar = on_pc2_.create<double>("lidar:3", depth_of(8)).value();
+  await_streams(1);
+  auto reader = session_.await_reader<double>("lidar:3").value();
+  expect_ok("overview", {program, kMotion, "lidar:3@pc2"});
+}
+
+TEST_F(ViewPage, FollowsASignalAndHoldsIt) {
+  auto motion = session_.create<Wheels>("motion", depth_of(1000)).value();
+  int ticks = 0;
+  Running page(page_argv("signal", {kMotion, "x"}), {});
+  lines(page, [&] {
+    motion.write({std::sin(0.05 * ticks), {0, 0}, ticks});
+    ++ticks;
+    std::this_thread::sleep_for(std::chrono::milliseconds(10));  // the stream's cycle
+  });
+}
+
+TEST_F(ViewPage, ShowsTheSamplesOfTheSlidersInstantAsDssmctlDoes) {
+  constexpr int kSamples = 200;
+  constexpr std::int64_t kCycle = 10'000'000;  // ns
+  auto motion = session_.create<Wheels>("motion", depth_of(kSamples + 1)).value();
+  auto lidar = on_pc2_.create<std::int64_t>("lidar", depth_of(kSamples + 1)).value();
+  for (int i = 0; i < kSamples; ++i) {
+    motion.write({1.0 * i, {0, 0}, i}, at_ns(1000 * kSecond + i * kCycle));
+    lidar.write(i, at_ns(1000 * kSecond + i * kCycle + i % 3 * 1'000'000));
+  }
+  await_streams(1);
+  Running page(page_argv("slider", {kMotion, "lidar:0@pc2"}), {});
+  int instants = 0;
+  for (const std::string& line : lines(page, [] {})) {
+    const std::vector<std::string> words = words_of(line);
+    if (words.size() != 4 || words[0] != "at") continue;
+    ++instants;
+    const std::string& ns = words[1];
+    ASSERT_GT(ns.size(), 9U) << line;
+    const std::string t = ns.substr(0, ns.size() - 9) + "." + ns.substr(ns.size() - 9);
+    EXPECT_EQ(json({"echo", kMotion, "--at", t})["tid"].dump(), words[2]) << line;
+    EXPECT_EQ(json({"echo", "lidar:0@pc2", "--at", t})["tid"].dump(), words[3]) << line;
+  }
+  EXPECT_EQ(instants, 6);
+}
+
+TEST_F(ViewPage, KeepsWhatIsChosenInItsUrl) {
+  auto motion = session_.create<Wheels>("motion", depth_of(8)).value();
+  motion.write({});
+  expect_ok("link", {kMotion, "x", "speed[1]", "ticks"});
+}
+
+TEST_F(ViewPage, DrawsScansPosesImagesAndBytes) {
+  PlanarScan wall{-1.5F, 3.0F / 64, {}};
+  std::fill(std::begin(wall.range_m), std::end(wall.range_m), 4.0F);
+  auto scan = session_.create<PlanarScan>("scan", depth_of(8)).value();
+  scan.write(wall);
+  auto pose = session_.create<PlanarPose>("pose", depth_of(64)).value();
+  for (int i = 0; i < 50; ++i)
+    pose.write({0.1 * i, 0.05 * i, 0.5}, at_ns(kSecond + i * 10'000'000));
+  // The pixel at column x and row y is x + y.
+  constexpr std::size_t kColumns = 160, kRows = 120;
+  std::vector<std::byte> picture(kColumns * kRows);
+  for (std::size_t i = 0; i < picture.size(); ++i) {
+    picture[i] = static_cast<std::byte>(i % kColumns + i / kColumns);
+  }
+  auto image =
+      session_.create_raw({"camera"}, TypeInfo{"", picture.size(), 1, {}}, depth_of(8)).value();
+  image.write(picture);
+  const std::vector<std::byte> some = {std::byte{0xde}, std::byte{0xad}, std::byte{0xbe},
+                                       std::byte{0xef}, std::byte{0}};
+  auto raw = session_.create_raw({"raw"}, TypeInfo{"", some.size(), 1, {}}, depth_of(8)).value();
+  raw.write(some);
+  expect_ok("views", {"scan:0@pc1", "pose:0@pc1", "camera:0@pc1", "raw:0@pc1"});
+}
+
+TEST_F(ViewPage, ShowsThatAHostIsDown) {
+  Running page(page_argv("host_down", {"pc2"}), {});
+  ASSERT_EQ(page.line(), "ready") << page.rest();
+  pc2_.kill_hard();
+  lines(page, [] {});
+}
+
+TEST_F(ViewPage, ReconnectsToDssmView) {
+  Running page(page_argv("reconnect", {}), {});
+  ASSERT_EQ(page.line(), "ready") << page.rest();
+  view_.signal(SIGKILL);
+  view_.status();
+  ASSERT_EQ(page.line(), "lost") << page.rest();
+  const std::string address = url_.substr(std::string("http://").size());
+  Running again(view_argv({"--listen", address.substr(0, address.size() - 1)}), environment());
+  ASSERT_TRUE(contains(again.line(), url_));
+  lines(page, [] {});
+}
+
+TEST_F(ViewPage, FitsAPhone) {
+  auto motion = session_.create<Wheels>("a-name-as-long-as-it-is-allowed", depth_of(8)).value();
+  motion.write({});
+  auto reader = session_.await_reader<Wheels>(motion.id().str()).value();
+  expect_ok("phone", {motion.id().str()});
+}
+
+}  // namespace
+}  // namespace dssm::test

@@ -1,0 +1,42 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What the tests of dssm-view share: dssm-view on pc1, whose dssmd knows pc2 and pc3.
+#pragma once
+
+#include <cstdlib>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "tests/process/dssmctl/fleet_test.hpp"
+
+namespace dssm::test {
+
+// The path of a file of the sources.
+inline std::string source(const std::string& path) {
+  const char* root = std::getenv("DSSM_SOURCE_ROOT");  // NOLINT(concurrency-mt-unsafe)
+  return std::string(root == nullptr ? "." : root) + "/" + path;
+}
+
+// The command line of dssm-view with the page of the sources.
+inline std::vector<std::string> view_argv(std::vector<std::string> words) {
+  std::vector<std::string> argv = {built("client/view/dssm-view"), "--pages",
+                                   source("client/view/web")};
+  argv.insert(argv.end(), words.begin(), words.end());
+  return argv;
+}
+
+class ViewTest : public FleetTest {
+ protected:
+  ViewTest() {
+    const std::string line = view_.line();
+    const std::size_t at = line.find("http://");
+    EXPECT_NE(at, std::string::npos) << line;
+    if (at != std::string::npos) url_ = line.substr(at);
+  }
+
+  Running view_{view_argv({"--listen", "127.0.0.1:0"}), environment()};
+  std::string url_;  // http://127.0.0.1:PORT/
+};
+
+}  // namespace dssm::test
