@@ -4,6 +4,7 @@
 #pragma once
 
 #include <cstdlib>
+#include <dssm/describe.hpp>
 #include <string>
 #include <utility>
 #include <vector>
@@ -25,6 +26,13 @@ inline std::vector<std::string> view_argv(std::vector<std::string> words) {
   argv.insert(argv.end(), words.begin(), words.end());
   return argv;
 }
+
+struct Motion {
+  double x;
+  float speed[3];
+  std::int32_t wheel;
+};
+DSSM_DESCRIBE(Motion, x, speed, wheel)
 
 class ViewTest : public FleetTest {
  protected:

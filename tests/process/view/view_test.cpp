@@ -10,13 +10,6 @@
 namespace dssm::test {
 namespace {
 
-struct Motion {
-  double x;
-  float speed[3];
-  std::int32_t wheel;
-};
-DSSM_DESCRIBE(Motion, x, speed, wheel)
-
 class View : public ViewTest {
  protected:
   std::string websocket_url() const { return "ws" + url_.substr(4); }
