@@ -72,6 +72,7 @@ class FoxgloveConnection : public Connection {
     if (*op == "unsubscribe") return unsubscribe(request);
     if (*op == "subscribeConnectionGraph") {
       wants_graph_ = true;
+      clients_.collector_.want_all();
       return send_graph();
     }
     if (*op == "unsubscribeConnectionGraph") {
@@ -107,6 +108,7 @@ class FoxgloveConnection : public Connection {
     }
   }
 
+  bool wants_graph() const { return wants_graph_; }
   void send_graph() {
     if (wants_graph_ && !clients_.graph_.empty()) peer_.send(Message::text(clients_.graph_));
   }
@@ -219,8 +221,9 @@ class FoxgloveConnection : public Connection {
   MonoTime next_time_{}, next_report_{};
 };
 
-FoxgloveClients::FoxgloveClients(Streams& streams, PlaybackClock clock)
+FoxgloveClients::FoxgloveClients(Streams& streams, StateCollector& collector, PlaybackClock clock)
     : streams_(streams),
+      collector_(collector),
       clock_(std::move(clock)),
       session_id_(std::to_string(to_ns(WallClock::now()))) {}
 
@@ -279,6 +282,7 @@ void FoxgloveClients::on_state(const VehicleState& state) {
   graph_ = graph;
   for (FoxgloveConnection* connection : connections_) {
     connection->advertise();
+    if (connection->wants_graph()) collector_.want_all();  // that is, the next one, too
     if (is_new_graph) connection->send_graph();
   }
 }

@@ -28,7 +28,7 @@ class FoxgloveConnection;
 class FoxgloveClients {
  public:
   // Both outlive it.
-  FoxgloveClients(Streams& streams, PlaybackClock clock);
+  FoxgloveClients(Streams& streams, StateCollector& collector, PlaybackClock clock);
 
   std::unique_ptr<Connection> connect(Peer& peer);
 
@@ -49,6 +49,7 @@ class FoxgloveClients {
   };
 
   Streams& streams_;
+  StateCollector& collector_;
   PlaybackClock clock_;
   std::string host_;
   std::map<std::uint32_t, Channel> channels_;  // by their ids

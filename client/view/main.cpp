@@ -87,7 +87,7 @@ Result<void> serve(Options options) {
   Streams streams(session, server);
   StateCollector collector(session, options.socket_path);
   Pages pages(streams, collector);
-  FoxgloveClients foxglove(streams, std::move(clock));
+  FoxgloveClients foxglove(streams, collector, std::move(clock));
   Worker scrapes;
 
   server.serve_websocket("dssm.view.v1", [&](Peer& peer) { return pages.connect(peer); });
