@@ -27,7 +27,7 @@ constexpr std::size_t kMaxUnanswered = 16;
 constexpr std::size_t kMaxStreams = 64;  // of one request
 constexpr std::size_t kMaxFields = 64;
 constexpr std::uint64_t kMaxPoints = 20'000;
-constexpr std::uint64_t kMaxPayloadBytes = 64U << 20;  // of one answer
+constexpr std::uint64_t kMaxPayloadBytes = 32U << 20;  // of one answer
 constexpr std::size_t kAlignment = 8;                  // of data in an answer
 
 Error bad_request(std::string text) { return {Errc::invalid_argument, std::move(text)}; }
@@ -301,6 +301,9 @@ class PageConnection : public Connection {
     }
     if (peer_.waiting() + waiting_for_state_.size() >= kMaxUnanswered) {
       return peer_.close("too many requests at once");
+    }
+    if (peer_.waiting_bytes() > kMaxPayloadBytes) {
+      return peer_.close("answers are to be read before more is asked");
     }
     const auto number = id->get<std::uint32_t>();
     const std::string op = text_of(request, "op");

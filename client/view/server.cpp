@@ -18,6 +18,7 @@ namespace dssm::view {
 namespace {
 
 constexpr std::size_t kMaxRequestBytes = 64U << 10;  // of a WebSocket's message to this server
+constexpr unsigned kMaxDescriptors = 256;            // of connections and files at once
 constexpr std::size_t kMaxReported = 100;            // different reasons for refusals, each once
 // Browsers ask each time whether a file has changed.
 constexpr int kRevalidate = 1;
@@ -197,10 +198,12 @@ Result<std::uint16_t> Server::listen() {
   info.user = this;
   info.options = LWS_SERVER_OPTION_FAIL_UPON_UNABLE_TO_BIND | LWS_SERVER_OPTION_VALIDATE_UTF8;
   info.keepalive_timeout = 60;
+  info.fd_limit_per_thread = kMaxDescriptors;
   if (!options_.certificate.empty()) {
     library.certificate = options_.certificate.string();
     library.key = options_.key.string();
     info.options |= LWS_SERVER_OPTION_DO_SSL_GLOBAL_INIT;
+    info.alpn = "http/1.1";  // HTTP/2 would bring nothing here
     info.ssl_cert_filepath = library.certificate.c_str();
     info.ssl_private_key_filepath = library.key.c_str();
     if (!options_.authority.empty()) {

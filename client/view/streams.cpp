@@ -19,6 +19,9 @@ void OpenStream::follow_restart() {
 }
 
 Streams::Found Streams::find(const std::string& name) {
+  if (!entries_.contains(name) && entries_.size() >= kMaxStreams) {
+    return {nullptr, "too many streams are open here; try again in half a minute"};
+  }
   Entry& entry = entries_[name];
   const MonoTime now = MonoClock::now();
   entry.used = now;

@@ -48,6 +48,7 @@ class Streams {
  private:
   static constexpr Duration kUnusedTime = std::chrono::seconds(30);
   static constexpr Duration kRetryPeriod = std::chrono::seconds(1);
+  static constexpr std::size_t kMaxStreams = 4096;  // that were asked for lately
 
   struct Entry {
     std::optional<OpenStream> stream;

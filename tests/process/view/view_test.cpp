@@ -5,6 +5,7 @@
 #include <fstream>
 
 #include "tests/process/view/view_fixture.hpp"
+#include "tests/support/folder.hpp"
 #include "tests/support/samples.hpp"
 
 namespace dssm::test {
@@ -302,6 +303,56 @@ TEST_F(View, DelaysNobodyForABrowserThatStands) {
   client.signal(SIGCONT);
   const std::string line = client.line();
   EXPECT_TRUE(contains(line, "samples were left out")) << line;
+}
+
+// --- TLS
+
+TEST_F(View, ByTlsServesOnlyClientsOfItsAuthority) {
+  if (text_of("/etc/machine-id").empty()) GTEST_SKIP() << "this machine has no id";
+  const TestFolder folder;
+  // A CA, and a certificate of it in the folder of that name.
+  const auto pki = [&](std::vector<std::string> words, const std::string& input = "") {
+    words.insert(words.begin(), {dssmctl_path(), "pki"});
+    const Finished finished = run(words, {}, input);
+    EXPECT_EQ(finished.exit_status, 0) << finished.err;
+    return finished.out;
+  };
+  const auto issue = [&](const std::string& ca, const std::string& kind, const std::string& name) {
+    const std::string credentials = folder.file(ca + "-" + name);
+    const std::string request = pki({"request", "--credentials", credentials, kind, name});
+    const std::string issued = pki({"issue", "-", "--ca", folder.file(ca)}, request);
+    pki({"install", "-", "--credentials", credentials}, issued);
+    return credentials;
+  };
+  for (const char* ca : {"truck", "other"}) pki({"init", "--ca", folder.file(ca), "--name", ca});
+  const std::string own = issue("truck", "--host", "pc1"),
+                    laptop = issue("truck", "--program", "laptop"),
+                    stranger = issue("other", "--program", "laptop");
+  Running secure(view_argv({"--listen", "127.0.0.1:0", "--certificate", own + "/own.crt", "--key",
+                            own + "/own.key", "--authority", own + "/ca.crt"}),
+                 environment());
+  const std::string line = secure.line();
+  ASSERT_TRUE(contains(line, "https://127.0.0.1:")) << line;
+  const std::string address = line.substr(line.find("127."), line.size() - 1 - line.find("127."));
+  // Of a GET with the certificate in that folder; empty: with none.
+  const auto get = [&](const std::string& certificate) {
+    return run({"/usr/bin/python3", "-c",
+                "import http.client, ssl, sys\n"
+                "address, authority, own = sys.argv[1:]\n"
+                "context = ssl.create_default_context(cafile=authority)\n"
+                "context.check_hostname = False\n"
+                "assert context.minimum_version >= ssl.TLSVersion.TLSv1_2\n"
+                "if own: context.load_cert_chain(own + '/own.crt', own + '/own.key')\n"
+                "client = http.client.HTTPSConnection(address, context=context)\n"
+                "client.request('GET', '/metrics')\n"
+                "print(client.getresponse().status, client.sock.version())\n",
+                address, own + "/ca.crt", certificate})
+        .out;
+  };
+  EXPECT_EQ(get(laptop), "200 TLSv1.3\n");
+  EXPECT_EQ(get(""), "");
+  EXPECT_EQ(get(stranger), "");
+  EXPECT_EQ(get(laptop), "200 TLSv1.3\n");
 }
 
 // --- the command line
