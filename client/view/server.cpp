@@ -4,6 +4,7 @@
 #include <arpa/inet.h>
 #include <fmt/format.h>
 #include <libwebsockets.h>
+#include <openssl/ssl.h>
 #include <unistd.h>
 
 #include <algorithm>
@@ -203,6 +204,7 @@ Result<std::uint16_t> Server::listen() {
     library.certificate = options_.certificate.string();
     library.key = options_.key.string();
     info.options |= LWS_SERVER_OPTION_DO_SSL_GLOBAL_INIT;
+    info.ssl_options_set = SSL_OP_NO_TLSv1 | SSL_OP_NO_TLSv1_1 | SSL_OP_NO_TLSv1_2;
     info.alpn = "http/1.1";  // HTTP/2 would bring nothing here
     info.ssl_cert_filepath = library.certificate.c_str();
     info.ssl_private_key_filepath = library.key.c_str();
