@@ -37,14 +37,17 @@ class Screen {
   Screen& operator=(const Screen&) = delete;
   ~Screen();
 
-  bool has_keyboard() const { return keyboard_ && keyboard_->is_there(); }
-
   // At this moment; 24 x 80 where the terminal does not state it.
   static ScreenSize size();
 
   // Draws as many lines as there are rows, each cut to the width. Writes nothing if that is what
   // the screen shows. False: standard output is not read any more.
   bool draw(const std::vector<ScreenLine>& lines, ScreenSize size);
+
+  // The next draw() writes all, whatever is there.
+  void clear() { shown_.clear(); }
+  // Whether nothing was drawn yet since it began, or since it was stopped or cleared.
+  bool is_blank() const { return shown_.empty(); }
 
   // Waits for a key, until `due`. May return nothing before that: when the size has changed, or
   // when it must be drawn again after a stop, for example.

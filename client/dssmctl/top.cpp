@@ -143,25 +143,36 @@ Result<void> show_on_terminal(const Session& session, TopState state, const TopO
   };
   StateReader reader(session, options.interval, wanted());
   Screen screen(out);  // the terminal is restored before the reader ends, which may have to wait
-  bool was_connected = true;
-  for (std::uint64_t updates = 1;;) {
-    const bool is_connected = session.is_connected();
-    display.set_connected(is_connected);
-    if (is_connected && !std::exchange(was_connected, is_connected)) reader.ask();
-    was_connected = is_connected;
+  constexpr Key kDrawAgain{'L' - '@'};  // Ctrl-L
+  bool was_connected = true, is_changed = true;
+  ScreenSize drawn_size;
+  for (std::uint64_t updates = 1; !out.must_stop();) {
     if (auto newer = reader.take(); newer && !display.is_held()) {
       display.set_state(std::move(*newer));
+      is_changed = true;
       ++updates;
     }
+    const bool is_connected = session.is_connected();
+    if (std::exchange(was_connected, is_connected) != is_connected) {
+      display.set_connected(is_connected);
+      is_changed = true;
+      if (is_connected) reader.ask();
+    }
     const ScreenSize size = Screen::size();
-    if (!screen.draw(display.lines(size), size)) return {};
+    if (is_changed || size != drawn_size || screen.is_blank()) {
+      if (!screen.draw(display.lines(size), size)) return {};
+      is_changed = false;
+      drawn_size = size;
+    }
     if (options.count && updates >= *options.count) return {};
-    if (out.must_stop()) return {};
     if (const auto key = screen.wait(deadline_in(kStopCheckPeriod))) {
       if (!display.on_key(*key)) return {};
+      if (*key == kDrawAgain) screen.clear();
       reader.request(wanted(), display.is_held());
+      is_changed = true;
     }
   }
+  return {};
 }
 
 // --- elsewhere
