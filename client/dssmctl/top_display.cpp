@@ -394,25 +394,26 @@ void TopDisplay::on_table_key(Key key) {
 }
 
 void TopDisplay::on_details_key(Key key) {
-  const auto back_by = [&](std::size_t lines) { first_line_ -= std::min(first_line_, lines); };
+  const std::size_t first = std::min(first_line_, last_first_line_);
+  const auto back_by = [&](std::size_t lines) { first_line_ = first - std::min(first, lines); };
   switch (static_cast<int>(key)) {
     case 'k':
     case static_cast<int>(Key::up):
       return back_by(1);
     case 'j':
     case static_cast<int>(Key::down):
-      first_line_ += 1;
+      first_line_ = first + 1;
       return;
     case static_cast<int>(Key::page_up):
       return back_by(page_);
     case static_cast<int>(Key::page_down):
-      first_line_ += page_;
+      first_line_ = first + page_;
       return;
     case static_cast<int>(Key::home):
       first_line_ = 0;
       return;
     case static_cast<int>(Key::end):
-      first_line_ = SIZE_MAX / 2;
+      first_line_ = SIZE_MAX;
       return;
     case static_cast<int>(Key::escape):
     case static_cast<int>(Key::enter):
@@ -600,8 +601,9 @@ void TopDisplay::add_text(std::vector<ScreenLine>& lines, const std::string& tex
     all.push_back(std::string_view(text).substr(at, end - at));
     at = end + 1;
   }
-  first_line_ = std::min(first_line_, all.size() > page_ ? all.size() - page_ : 0);
-  for (std::size_t i = first_line_; i < all.size() && i < first_line_ + page_; ++i) {
+  last_first_line_ = all.size() > page_ ? all.size() - page_ : 0;
+  const std::size_t first = std::min(first_line_, last_first_line_);
+  for (std::size_t i = first; i < all.size() && i < first + page_; ++i) {
     lines.push_back({shortened(all[i], size.columns)});
   }
 }

@@ -118,9 +118,11 @@ class TopDisplay {
   ViewState views_[3];
   Mode mode_ = Mode::table;
   Mode before_help_ = Mode::table;
-  std::string filter_before_;   // while one is typed
-  std::string detailed_;        // identity of the row whose details are shown
-  std::size_t first_line_ = 0;  // of details
+  std::string filter_before_;  // while one is typed
+  std::string detailed_;       // identity of the row whose details are shown
+  // Of details: the line that is wanted at the top, beyond the last one that can be there for the
+  // end, also of a text that grows.
+  std::size_t first_line_ = 0, last_first_line_ = 0;
   std::size_t page_ = 1;        // rows of the table or of details that are seen
   std::optional<Shown> shown_;  // none: to be made
 };

@@ -136,10 +136,11 @@ class TerminalScreen {
   std::string pending_;
 };
 
+// So many fields that details are longer than the screen.
 struct Pose {
-  double x, y;
+  double x, y, z, roll, pitch, yaw;
 };
-DSSM_DESCRIBE(Pose, x, y)
+DSSM_DESCRIBE(Pose, x, y, z, roll, pitch, yaw)
 
 class TopOnATerminal : public FleetTest {
  protected:
@@ -243,7 +244,7 @@ class TopOnATerminal : public FleetTest {
 
 TEST_F(TopOnATerminal, ShowsThreeViews) {
   await_streams(1);
-  odometry_.write({1, 2}, at_ns(0), Duration());
+  odometry_.write({}, at_ns(0), Duration());
   top();
   await_names({"odometry", "lidar", "camera"});
   EXPECT_TRUE(screen_.is_alternate);
@@ -281,8 +282,8 @@ TEST_F(TopOnATerminal, SortsByKeys) {
   press("r");
   await_names({"odometry", "camera", "lidar"});
   press("<<<<");  // size, host, id, name
+  await_row(1, "by name");
   await_names({"camera", "lidar", "odometry"});
-  EXPECT_TRUE(contains(screen_.text(1), "by name")) << screen_.text(1);
   press("S");
   await_row(1, "by id");
   press("hS");  // each view has its own order
@@ -315,7 +316,7 @@ TEST_F(TopOnATerminal, Filters) {
 
 TEST_F(TopOnATerminal, ShowsDetailsOfTheSelectedRow) {
   await_streams(1);
-  odometry_.write({1, 2}, at_ns(0), Duration());
+  odometry_.write({}, at_ns(0), Duration());
   top();
   await_names({"odometry", "lidar", "camera"});
   await_selected("odometry");

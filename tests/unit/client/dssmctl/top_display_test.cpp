@@ -243,6 +243,17 @@ TEST(TopDisplay, ShowsDetailsUntilTheRowIsGone) {
   EXPECT_FALSE(has_user(screen_texts(display, {10, 40})));
   display.on_key(Key::end);
   EXPECT_TRUE(has_user(screen_texts(display, {10, 40})));
+  state.details->users.push_back({.pid = 4, .program = "last", .host = "pc2"});
+  display.set_state(state);
+  EXPECT_TRUE(screen_texts(display, {10, 40})[8].starts_with("last")) << "still the end";
+  display.on_key(Key::up);
+  EXPECT_TRUE(screen_texts(display, {10, 40})[8].starts_with("driver"));
+  display.on_key(Key::down);
+  display.on_key(Key::down);
+  display.on_key(Key::down);
+  EXPECT_TRUE(screen_texts(display, {10, 40})[8].starts_with("last"));
+  display.on_key(Key::up);
+  EXPECT_TRUE(screen_texts(display, {10, 40})[8].starts_with("driver"));
   state.details.reset();
   state.streams.erase(state.streams.begin() + 2);
   display.set_state(state);
