@@ -1,4 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
+//
+// What top shows and how it follows keys, without a terminal.
 #include "client/dssmctl/top_display.hpp"
 
 #include <gtest/gtest.h>
