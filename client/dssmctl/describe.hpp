@@ -58,4 +58,8 @@ std::string carried_text(const StreamInfo& stream);
 
 std::string_view role_name(Role role);
 
+// All of a stream, as `dssmctl info` shows it (info.cpp).
+//   iso  times as ISO 8601
+void print_stream(const StreamInfo& stream, bool iso, Output& out);
+
 }  // namespace dssm::ctl

@@ -84,7 +84,7 @@ _dssmctl() {
         [[ $verb != hz && $verb != bw && $verb != delay ]] || ((++i))
         ;;
       --socket | --sort | --host | --at | --count | -n | -c | --field | --wait | --window | \
-        --interval | -i | --size | --table | --depth | --life | --cycle | --type | --align | --offset | \
+        --interval | -i | --every | --view | --size | --table | --depth | --life | --cycle | --type | --align | --offset | \
         --speed | --time | --rate | --ca | --credentials | --out | --name | --program | --days | \
         --output | -o | --past | --span | --until | --for | --compression | --max-file-size | \
         --max-file-duration | --max-total-size | --from | --to | --map | --lockstep | --before | \
@@ -115,6 +115,11 @@ _dssmctl() {
       return
       ;;
     --sort)
+      if [[ $verb == top ]]; then
+        mapfile -t COMPREPLY < <(compgen -W "age clock created cycle depth found host id memory \
+          name pid program rate readers reads rtt size state streams type writers writes" -- "$cur")
+        return
+      fi
       mapfile -t COMPREPLY < <(compgen -W "created name id host size depth cycle rate age writers \
         readers type memory" -- "$cur")
       return
@@ -122,6 +127,10 @@ _dssmctl() {
     --stream) return ;; # of a recording
     --host)
       _dssmctl_offer < <(_dssmctl_ask hosts --names)
+      return
+      ;;
+    --view)
+      mapfile -t COMPREPLY < <(compgen -W "hosts programs streams" -- "$cur")
       return
       ;;
     --compression)
@@ -132,7 +141,7 @@ _dssmctl() {
       _dssmctl_offer < <(_dssmctl_fields "$first")
       return
       ;;
-    --at | --count | -n | -c | --wait | --window | --interval | -i | --size | --table | \
+    --at | --count | -n | -c | --wait | --window | --interval | -i | --every | --size | --table | \
       --depth | --life | --cycle | --type | --align | --offset | --speed | --time | --rate | --name | \
       --program | --days | --past | --until | --for | --max-file-size | --max-file-duration | \
       --max-total-size | --from | --to | --map | --before | --after | --trigger | --min-interval | \
@@ -147,6 +156,7 @@ _dssmctl() {
     ls) options="--host --local --names --own --reverse --sort --watch" ;;
     hosts) options="--names --watch" ;;
     nodes) options="--host" ;;
+    top) options="--count --every --interval --reverse --sort --view" ;;
     graph) options="--out" ;;
     info) options="--watch" ;;
     clock) options="--matrix --table --wait --watch" ;;
@@ -185,7 +195,7 @@ _dssmctl() {
     "" | help)
       mapfile -t COMPREPLY < <(compgen -W \
         "bw clock convert create delay describe doctor echo find graph hosts hz info ls metrics nodes ping pki \
-          play playback plot property pub record rights rm show trigger" -- "$cur")
+          play playback plot property pub record rights rm show top trigger" -- "$cur")
       ;;
     property) mapfile -t COMPREPLY < <(compgen -W "get set" -- "$cur") ;;
     playback) mapfile -t COMPREPLY < <(compgen -W "pause reset resume set show" -- "$cur") ;;

@@ -38,7 +38,7 @@ function __dssmctl_candidates
                 # A value only where it is --rate.
                 contains -- "$verb" pub play; and set i (math $i + 1)
             case --socket --sort --host --at --count -n -c --field --wait --window --interval -i \
-                --size --table --depth --life --cycle --type --align --offset --speed --time --rate --ca \
+                --every --view --size --table --depth --life --cycle --type --align --offset --speed --time --rate --ca \
                 --credentials --out --name --program --days --output -o --past --span --until --for \
                 --compression --max-file-size --max-file-duration --max-total-size --from --to --map \
                 --before --after --trigger --min-interval --max-incident --quota --reason --config \
@@ -74,10 +74,18 @@ function __dssmctl_candidates
             __dssmctl_ask info --json $positional[1] |
                 sed -n '/"fields": \[/,/^  \]/s/^ *"name": "\(.*\)",$/\1/p'
             return
+        case --view
+            printf '%s\n' hosts programs streams
+            return
         case --sort
+            if test "$verb" = top
+                printf '%s\n' age clock created cycle depth found host id memory name pid program \
+                    rate readers reads rtt size state streams type writers writes
+                return
+            end
             printf '%s\n' created name id host size depth cycle rate age writers readers type memory
             return
-        case --at --count -n -c --wait --window --interval -i --size --table --depth --life --cycle \
+        case --at --count -n -c --wait --window --interval -i --every --size --table --depth --life --cycle \
             --type --align --offset --speed --time --rate --name --program --days --past --until --for \
             --max-file-size --max-file-duration --max-total-size --from --to --map --before --after \
             --trigger --min-interval --max-incident --quota --reason

@@ -109,6 +109,8 @@ void print_mirror(const StreamInfo& stream, const MirrorInfo& mirror, Output& ou
   add_line(out, "restarts", mirror.restarts);
 }
 
+}  // namespace
+
 void print_stream(const StreamInfo& stream, bool iso, Output& out) {
   out.add(out.bold(escaped(stream.id.str())) + "\n");
   add_line(out, "owner", "host " + escaped(stream.id.host));
@@ -140,6 +142,8 @@ void print_stream(const StreamInfo& stream, bool iso, Output& out) {
   }
   print_users(stream, out);
 }
+
+namespace {
 
 Json credentials_json(const DaemonInfo& daemon) {
   if (!daemon.credentials) return {};

@@ -19,85 +19,21 @@
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/options.hpp"
 #include "client/dssmctl/output.hpp"
+#include "client/dssmctl/stream_list.hpp"
 #include "client/dssmctl/text.hpp"
 #include "core/base/try.hpp"
 
 namespace dssm::ctl {
 namespace {
 
-// Sorts by what `key` gives, keeping the order of creation among equals.
-template <class Key>
-void sort_by(std::vector<StreamInfo>& streams, Key key) {
-  std::stable_sort(streams.begin(), streams.end(),
-                   [&](const StreamInfo& a, const StreamInfo& b) { return key(a) < key(b); });
-}
-
-// Numbers rise; streams whose age is not known come last in "age".
-void sort_streams(std::vector<StreamInfo>& streams, const std::string& key) {
-  if (key == "name")
-    return sort_by(streams, [](const auto& s) { return std::pair(s.id.name, s.id.id); });
-  if (key == "id")
-    return sort_by(streams, [](const auto& s) { return std::pair(s.id.id, s.id.name); });
-  if (key == "host") return sort_by(streams, [](const auto& s) { return s.id.host; });
-  if (key == "size") return sort_by(streams, [](const auto& s) { return s.type.payload_bytes; });
-  if (key == "depth") return sort_by(streams, [](const auto& s) { return s.depth; });
-  if (key == "cycle") return sort_by(streams, [](const auto& s) { return s.cycle; });
-  if (key == "rate") {
-    return sort_by(streams, [](const auto& s) { return is_silent(s) ? 0 : s.rate_hz; });
-  }
-  if (key == "writers") return sort_by(streams, [](const auto& s) { return s.writers; });
-  if (key == "readers") return sort_by(streams, [](const auto& s) { return s.readers; });
-  if (key == "type") return sort_by(streams, [](const auto& s) { return s.type.name; });
-  if (key == "memory") return sort_by(streams, [](const auto& s) { return s.memory_bytes; });
-  if (key == "age") {
-    return sort_by(streams, [](const auto& s) {
-      return std::pair(!is_age_known(s), is_age_known(s) ? s.age : Duration());
-    });
-  }
-}
-
-constexpr std::string_view kDuplicateMark = " *";
-
-// `with_id`: the id has a column of its own.
-std::vector<std::string> row(const StreamInfo& stream, bool duplicate, bool with_id) {
-  return {
-      escaped(with_id ? stream.id.name : short_name(stream.id))
-          .append(duplicate ? kDuplicateMark : ""),
-      std::to_string(stream.id.id),
-      escaped(stream.id.host),
-      std::to_string(stream.type.payload_bytes),
-      std::to_string(stream.depth),
-      duration_text(stream.cycle),
-      rate_text(stream),
-      age_text(stream),
-      state_cell(stream),
-      count_text(stream, stream.writers),
-      count_text(stream, stream.readers),
-      or_dash(escaped(stream.type.name)),
-  };
-}
-
-// What to show, in order. The marks follow from all that there is, shown or not; without the
-// other hosts' streams they are not known.
-struct Listing {
-  std::vector<StreamInfo> streams;
-  std::optional<Duplicates> duplicates;
-
-  bool duplicate(const StreamInfo& stream) const {
-    return duplicates && duplicates->has(stream.id);
-  }
-};
-
 // A document as json_document() writes it, but without a tree of a thousand streams in memory.
-void print_json(const Listing& listing, Output& out) {
+void print_json(const StreamListing& listing, Output& out) {
   if (listing.streams.empty()) return out.add(json_document({{"streams", Json::array()}}));
   out.add("{\n  \"streams\": [\n");
   std::string_view separator;
   for (const StreamInfo& stream : listing.streams) {
-    Json json = stream_json(stream);
-    json["duplicate"] = listing.duplicates ? Json(listing.duplicate(stream)) : Json();
     out.add(separator);
-    std::string text = json_document(json);
+    std::string text = json_document(listed_stream_json(listing, stream));
     text.pop_back();  // its line end
     // Strings in JSON have no line ends.
     for (std::size_t at = 0; at != text.npos; at = text.find('\n', at + 1)) {
@@ -109,31 +45,8 @@ void print_json(const Listing& listing, Output& out) {
   out.add("\n  ]\n}\n");
 }
 
-Table table_of(const Listing& listing, bool with_id) {
-  constexpr auto kLeft = Table::Align::left, kRight = Table::Align::right;
-  Table table({{"NAME"},
-               {"ID", kRight, 1},
-               {"HOST"},
-               {"SIZE", kRight, 3},
-               {"DEPTH", kRight, 2},
-               {"CYCLE", kRight, 4},
-               {"RATE", kRight},
-               {"AGE", kRight},
-               {"STATE"},
-               {"WRITERS", kRight},
-               {"READERS", kRight},
-               {"TYPE", kLeft, 0, Table::Column::Fit::cut}});
-  for (const StreamInfo& stream : listing.streams) {
-    table.add_row(row(stream, listing.duplicate(stream), with_id));
-  }
-  return table;
-}
-
-void print_table(const Listing& listing, Output& out) {
-  Table table = table_of(listing, true);
-  // The column of ids is the first one to go.
-  if (!table.fits(out.columns())) table = table_of(listing, false);
-  table.print(out);
+void print_table(const StreamListing& listing, Output& out) {
+  stream_table(listing, out.columns()).print(out);
   const auto marked =
       std::find_if(listing.streams.rbegin(), listing.streams.rend(),
                    [&](const StreamInfo& stream) { return listing.duplicate(stream); });
@@ -310,7 +223,7 @@ Result<void> run(const LsOptions& options, Output& out) {
   const std::size_t all = streams.size();
   const StreamFilter filter(options.hosts, patterns_of(options));
   if (options.names) return print_names(session, streams, filter, out);
-  Listing listing;
+  StreamListing listing;
   if (!options.own) listing.duplicates.emplace(streams);
   std::erase_if(streams, [&](const StreamInfo& stream) { return !filter.takes(stream.id); });
   listing.streams = std::move(streams);

@@ -16,11 +16,14 @@
 #include <filesystem>
 #include <limits>
 #include <memory>
+#include <span>
 
 #include "client/dssmctl/config_words.hpp"
 #include "client/dssmctl/names.hpp"
 #include "client/dssmctl/recording_info.hpp"
+#include "client/dssmctl/stream_list.hpp"
 #include "client/dssmctl/text.hpp"
+#include "client/dssmctl/top_display.hpp"
 #include "client/dssmctl/trigger_watch.hpp"
 #include "core/base/try.hpp"
 
@@ -173,13 +176,11 @@ void check_ls(const LsOptions& options) {
           "--watch shows changes in the order in which they come: omit --sort and --reverse");
 }
 
-std::string check_sort_key(std::string& key) {
-  static constexpr std::array kKeys = {"created", "name",  "id",    "host", "size",
-                                       "depth",   "cycle", "rate",  "age",  "writers",
-                                       "readers", "type",  "memory"};
-  if (std::find(kKeys.begin(), kKeys.end(), key) != kKeys.end()) return {};
+// What is wrong with `key`; empty: it is one of `keys`.
+std::string check_sort_key(std::string_view key, std::span<const std::string_view> keys) {
+  if (std::find(keys.begin(), keys.end(), key) != keys.end()) return {};
   return fmt::format("'{}' is not a key to sort by; there are {}", escaped(key),
-                     fmt::join(kKeys, ", "));
+                     fmt::join(keys, ", "));
 }
 
 void add_ls(CLI::App& app, Parsed& parsed) {
@@ -203,7 +204,9 @@ void add_ls(CLI::App& app, Parsed& parsed) {
                  "created, name, id, host, size, depth, cycle, rate, age, writers, readers, type "
                  "or memory (default: created)")
       ->type_name("KEY")
-      ->check(CLI::Validator(check_sort_key, ""));
+      ->check(CLI::Validator(
+          std::function([](std::string& key) { return check_sort_key(key, stream_sort_keys()); }),
+          ""));
   ls->add_flag("-r,--reverse", options.reverse, "in reverse order");
   add_wide(ls, parsed);
 }
@@ -232,6 +235,39 @@ void add_nodes(CLI::App& app, Parsed& parsed) {
                    "only processes on this host; may be given several times")
       ->type_name("HOST")
       ->allow_extra_args(false);  // one value per --host, so that PATTERN may follow
+}
+
+void check_top(const TopOptions& options) {
+  if (options.sort.empty()) return;
+  const std::string error = check_sort_key(options.sort, sort_keys(options.view));
+  require(error.empty(), error + "; --view hosts and --view programs have keys of their own");
+}
+
+void add_top(CLI::App& app, Parsed& parsed) {
+  CLI::App* top = app.add_subcommand("top", "streams, hosts and programs, redrawn each second");
+  TopOptions& options = add_options<TopOptions>(top, parsed, check_top);
+  top->add_option("PATTERN", options.pattern,
+                  "only rows whose name this shell pattern fits, or that have this part")
+      ->type_name("");
+  add_parsed(top, "--view", "VIEW", "streams, hosts or programs (default: streams)",
+             [&options](const std::string& text) -> Result<void> {
+               for (const TopView view : {TopView::streams, TopView::hosts, TopView::programs}) {
+                 if (text != view_name(view)) continue;
+                 options.view = view;
+                 return {};
+               }
+               return Error{Errc::invalid_argument,
+                            fmt::format("'{}' is not a view; there are streams, hosts and programs",
+                                        escaped(text))};
+             });
+  top->add_option("--sort", options.sort,
+                  "streams: as `ls` sorts; hosts: found, host, state, rtt, streams or clock; "
+                  "programs: host, pid, program, writes or reads")
+      ->type_name("KEY");
+  top->add_flag("-r,--reverse", options.reverse, "in reverse order");
+  add_seconds(top, "-i,--interval,--every", "time between two updates (default: 1)",
+              options.interval, Range::positive);
+  add_whole(top, "-n,--count", "N", "end after N updates", options.count, 1);
 }
 
 void add_graph(CLI::App& app, Parsed& parsed) {
@@ -881,6 +917,7 @@ void add_all(CLI::App& app, Parsed& parsed) {
   add_ls(app, parsed);
   add_hosts(app, parsed);
   add_nodes(app, parsed);
+  add_top(app, parsed);
   add_graph(app, parsed);
   add_clock(app, parsed);
   add_options<DoctorOptions>(
@@ -938,21 +975,46 @@ std::vector<std::string> verbs_of(const CLI::App& app) {
 
 // What is called otherwise elsewhere: by people, ROS 2, SSM, or this program's earlier versions.
 // Where two words name it, those of one word follow.
-constexpr std::pair<std::string_view, std::string_view> kOtherNames[] = {
-    {"list", "ls"},           {"topic", "ls"},           {"topics", "ls"},
-    {"streams", "ls"},        {"top", "ls --watch"},     {"monitor", "ls --watch"},
-    {"watch", "ls --watch"},  {"cat", "echo"},           {"read", "echo"},
-    {"publish", "pub"},       {"write", "pub"},          {"rate", "hz"},
-    {"bandwidth", "bw"},      {"latency", "delay"},      {"describe", "info"},
-    {"stat", "info"},         {"type", "info"},          {"interface list", "find"},
-    {"interface", "show"},    {"delete", "rm"},          {"remove", "rm"},
-    {"new", "create"},        {"status", "doctor"},      {"check", "doctor"},
-    {"wtf", "doctor"},        {"peers", "hosts"},        {"host", "hosts"},
-    {"node", "nodes"},        {"processes", "nodes"},    {"ps", "nodes"},
-    {"param", "property"},    {"bag info", "info FILE"}, {"bag play", "play"},
-    {"bag", "record"},        {"rec", "record"},         {"logger", "record"},
-    {"replay", "play"},       {"player", "play"},        {"time", "clock"},
-    {"version", "--version"}, {"incident", "trigger"}};
+constexpr std::pair<std::string_view, std::string_view> kOtherNames[] = {{"list", "ls"},
+                                                                         {"topic", "ls"},
+                                                                         {"topics", "ls"},
+                                                                         {"streams", "ls"},
+                                                                         {"monitor", "top"},
+                                                                         {"watch", "ls --watch"},
+                                                                         {"cat", "echo"},
+                                                                         {"read", "echo"},
+                                                                         {"publish", "pub"},
+                                                                         {"write", "pub"},
+                                                                         {"rate", "hz"},
+                                                                         {"bandwidth", "bw"},
+                                                                         {"latency", "delay"},
+                                                                         {"describe", "info"},
+                                                                         {"stat", "info"},
+                                                                         {"type", "info"},
+                                                                         {"interface list", "find"},
+                                                                         {"interface", "show"},
+                                                                         {"delete", "rm"},
+                                                                         {"remove", "rm"},
+                                                                         {"new", "create"},
+                                                                         {"status", "doctor"},
+                                                                         {"check", "doctor"},
+                                                                         {"wtf", "doctor"},
+                                                                         {"peers", "hosts"},
+                                                                         {"host", "hosts"},
+                                                                         {"node", "nodes"},
+                                                                         {"processes", "nodes"},
+                                                                         {"ps", "nodes"},
+                                                                         {"param", "property"},
+                                                                         {"bag info", "info FILE"},
+                                                                         {"bag play", "play"},
+                                                                         {"bag", "record"},
+                                                                         {"rec", "record"},
+                                                                         {"logger", "record"},
+                                                                         {"replay", "play"},
+                                                                         {"player", "play"},
+                                                                         {"time", "clock"},
+                                                                         {"version", "--version"},
+                                                                         {"incident", "trigger"}};
 
 // "ls", for a verb that `app` has not; `next` is the word after it. Empty: nothing is like it.
 std::string meant_verb(const CLI::App& app, std::string_view word, std::string_view next) {

@@ -47,6 +47,17 @@ struct NodesOptions : CommonOptions {
   std::vector<std::string> hosts;  // only theirs; empty: of all
 };
 
+enum class TopView : unsigned char { streams, hosts, programs };
+
+struct TopOptions : CommonOptions {
+  std::string pattern;              // a shell pattern or a part of the name; empty: all
+  TopView view = TopView::streams;  // that is shown first
+  std::string sort;                 // a key of that view; empty: as dssmd lists it
+  bool reverse = false;
+  Duration interval = std::chrono::seconds(1);
+  std::optional<std::uint64_t> count;
+};
+
 struct GraphOptions : CommonOptions {
   std::string out;     // the file to write; empty: standard output
   std::string format;  // of that file, by its name: "dot", "svg", "png"
@@ -238,13 +249,13 @@ struct PkiShowOptions : CommonOptions {
 };
 
 using Options =
-    std::variant<LsOptions, HostsOptions, NodesOptions, GraphOptions, ClockOptions, DoctorOptions,
-                 MetricsOptions, PlotOptions, PingOptions, InfoOptions, EchoOptions, PubOptions,
-                 RecordOptions, TriggerOptions, PlayOptions, ConvertOptions, FindOptions,
-                 ShowOptions, HzOptions, BwOptions, DelayOptions, CreateOptions, DescribeOptions,
-                 RmOptions, RightsOptions, PropertyGetOptions, PropertySetOptions, PlaybackOptions,
-                 PkiInitOptions, PkiRequestOptions, PkiIssueOptions, PkiInstallOptions,
-                 PkiRenewOptions, PkiRevokeOptions, PkiShowOptions>;
+    std::variant<LsOptions, HostsOptions, NodesOptions, TopOptions, GraphOptions, ClockOptions,
+                 DoctorOptions, MetricsOptions, PlotOptions, PingOptions, InfoOptions, EchoOptions,
+                 PubOptions, RecordOptions, TriggerOptions, PlayOptions, ConvertOptions,
+                 FindOptions, ShowOptions, HzOptions, BwOptions, DelayOptions, CreateOptions,
+                 DescribeOptions, RmOptions, RightsOptions, PropertyGetOptions, PropertySetOptions,
+                 PlaybackOptions, PkiInitOptions, PkiRequestOptions, PkiIssueOptions,
+                 PkiInstallOptions, PkiRenewOptions, PkiRevokeOptions, PkiShowOptions>;
 
 // Either options to work with, or a text that ends the program at once: help and version on
 // standard output, an error on standard error.
@@ -262,6 +273,7 @@ CommandLine parse_command_line(int argc, const char* const* argv);
 Result<void> run(const LsOptions& options, Output& out);
 Result<void> run(const HostsOptions& options, Output& out);
 Result<void> run(const NodesOptions& options, Output& out);
+Result<void> run(const TopOptions& options, Output& out);
 Result<void> run(const GraphOptions& options, Output& out);
 Result<void> run(const ClockOptions& options, Output& out);
 Result<void> run(const DoctorOptions& options, Output& out);

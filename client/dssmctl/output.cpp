@@ -192,13 +192,38 @@ Layout layout_of(const std::vector<Table::Column>& columns, std::vector<std::siz
   for (unsigned drop = 1; drop <= columns.size() && layout.width() > available; ++drop) {
     std::erase_if(layout.shown, [&](std::size_t i) { return columns[i].drop == drop; });
   }
-  for (const std::size_t i : layout.shown) {
-    if (layout.width() <= available || columns[i].fit != Fit::cut) continue;
-    const std::size_t excess = layout.width() - available;
-    const std::size_t least = std::min(layout.widths[i], columns_of(columns[i].title));
-    layout.widths[i] -= std::min(excess, layout.widths[i] - least);
+  while (layout.width() > available) {
+    std::size_t* widest = nullptr;
+    for (const std::size_t i : layout.shown) {
+      std::size_t& width = layout.widths[i];
+      const bool can_be_cut = columns[i].fit == Fit::cut && width > columns_of(columns[i].title);
+      if (can_be_cut && (!widest || width > *widest)) widest = &width;
+    }
+    if (!widest) break;
+    --*widest;
   }
   return layout;
+}
+
+std::string line_of(const std::vector<Table::Column>& columns, const Layout& layout,
+                    const std::vector<std::string>& cells) {
+  std::string line;
+  for (const std::size_t i : layout.shown) {
+    const std::string cell = shortened(cells[i], layout.widths[i]);
+    const std::size_t blanks = layout.widths[i] - columns_of(cell);
+    if (i != layout.shown.front()) line.append(kBetween, ' ');
+    if (columns[i].align == Table::Align::right) line.append(blanks, ' ');
+    line += cell;
+    if (columns[i].align == Table::Align::left) line.append(blanks, ' ');
+  }
+  line.erase(line.find_last_not_of(' ') + 1);
+  return line;
+}
+
+std::string header_of(const std::vector<Table::Column>& columns, const Layout& layout) {
+  std::vector<std::string> titles;
+  for (const Table::Column& column : columns) titles.push_back(column.title);
+  return line_of(columns, layout, titles);
 }
 
 // `text` in lines of `columns` columns at most, broken at blanks, each after four blanks.
@@ -229,30 +254,24 @@ bool Table::fits(std::size_t columns) const {
 
 void Table::print(Output& out) const {
   const Layout layout = layout_of(columns_, widths(), out.columns());
-  std::string line;
-  const auto add_cell = [&](std::size_t i, std::string_view whole) {
-    const std::string cell = shortened(whole, layout.widths[i]);
-    const std::size_t blanks = layout.widths[i] - columns_of(cell);
-    if (i != layout.shown.front()) line.append(kBetween, ' ');
-    if (columns_[i].align == Align::right) line.append(blanks, ' ');
-    line += cell;
-    if (columns_[i].align == Align::left) line.append(blanks, ' ');
-  };
-  const auto end_line = [&] { line.erase(line.find_last_not_of(' ') + 1); };
-
-  for (const std::size_t i : layout.shown) add_cell(i, columns_[i].title);
-  end_line();
-  out.add(out.bold(line));
+  out.add(out.bold(header_of(columns_, layout)));
   out.add("\n");
   for (const auto& row : rows_) {
-    line.clear();
-    for (const std::size_t i : layout.shown) add_cell(i, row[i]);
-    end_line();
-    out.add(line);
+    out.add(line_of(columns_, layout, row));
     out.add("\n");
     const bool is_empty = row.back().empty() || row.back() == "-";
     if (layout.last_below && !is_empty) out.add(wrapped(row.back(), out.columns()));
   }
+}
+
+std::vector<std::string> Table::lines(std::size_t columns, std::size_t first,
+                                      std::size_t count) const {
+  const Layout layout = layout_of(columns_, widths(), columns);
+  std::vector<std::string> lines = {header_of(columns_, layout)};
+  for (std::size_t i = first; i < rows_.size() && i - first < count; ++i) {
+    lines.push_back(line_of(columns_, layout, rows_[i]));
+  }
+  return lines;
 }
 
 }  // namespace dssm::ctl

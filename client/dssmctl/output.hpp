@@ -9,6 +9,7 @@
 #include <nlohmann/json.hpp>
 #include <string>
 #include <string_view>
+#include <utility>
 #include <vector>
 
 namespace dssm::ctl {
@@ -29,6 +30,10 @@ class Output {
 
   // Flushes when a good amount is pending: for verbs that print without end.
   bool flush_some() { return pending_.size() < kBatchBytes ? !stopped_ : flush(); }
+
+  // What is pending, for a text that is shown otherwise than by flush(), which does not write it
+  // then.
+  std::string take() { return std::exchange(pending_, {}); }
 
   // Whether a verb that runs until Ctrl-C must end: a stop signal came, or the other end of a pipe
   // was closed, also while nothing is written.
@@ -90,7 +95,7 @@ class Table {
     // What to do when the table is too wide, in this order: a column that may be below (the last
     // one only) has its cells in lines of their own, after their rows, but for those that are
     // empty or "-"; columns are left out, from
-    // drop = 1 on; one that may be short is cut.
+    // drop = 1 on; those that may be short are cut, the widest ones first.
     unsigned drop = 0;  // 0: never
     enum class Fit : unsigned char { whole, below, cut } fit = Fit::whole;
   };
@@ -105,6 +110,13 @@ class Table {
 
   // Header (bold on a terminal) and rows, without blanks at the ends of lines.
   void print(Output& out) const;
+
+  // The header, then `count` rows at most from row number `first` on, a line each, for a window
+  // that shows a part of them: columns are as wide as all rows need. What belongs below a row is
+  // left out; a line may be too wide where the columns do not allow more.
+  std::vector<std::string> lines(std::size_t columns, std::size_t first, std::size_t count) const;
+
+  std::size_t rows() const { return rows_.size(); }
 
  private:
   std::vector<std::size_t> widths() const;

@@ -439,8 +439,8 @@ class Player {
         return jump_to(timeline, saturating_add(timeline.now(), kJump));
       case Key::home:
         return jump_to(timeline, range_.from);
-      case Key::q:
-        break;
+      default:
+        return {};
     }
     shows_now_ = true;
     return {};

@@ -60,7 +60,7 @@ bool is_treacherous(char32_t c) {
 }
 
 // Its columns on the screen; 0: it is not to be printed.
-std::size_t columns_of(char32_t c) {
+std::size_t character_columns(char32_t c) {
   if (c < 0x80) return printable(static_cast<char>(c)) ? 1 : 0;
   if (!prints_utf8 || is_treacherous(c)) return 0;
   const int width = ::wcwidth(static_cast<wchar_t>(c));
@@ -74,7 +74,7 @@ std::string escape(std::string_view bytes, std::string_view escape_too) {
     const char c = bytes.front();
     char32_t character = 0;
     const std::size_t size = decode(bytes, character);
-    if (size > 1 && columns_of(character) > 0) {
+    if (size > 1 && character_columns(character) > 0) {
       out += bytes.substr(0, size);
       bytes.remove_prefix(size);
       continue;
@@ -250,7 +250,7 @@ std::size_t columns_of(std::string_view text) {
   while (!text.empty()) {
     char32_t character = 0;
     const std::size_t size = std::max<std::size_t>(1, decode(text, character));
-    columns += columns_of(character);
+    columns += character_columns(character);
     text.remove_prefix(size);
   }
   return columns;
@@ -264,7 +264,7 @@ std::string shortened(std::string_view text, std::size_t columns) {
   for (std::size_t used = 0; bytes < text.size();) {
     char32_t character = 0;
     const std::size_t size = std::max<std::size_t>(1, decode(text.substr(bytes), character));
-    used += columns_of(character);
+    used += character_columns(character);
     if (used > rest) break;
     bytes += size;
   }

@@ -159,6 +159,8 @@ TEST_F(Completion, IsQuietWithoutADaemon) {
 
 TEST_F(Completion, OffersKeysToSortByAndFiles) {
   EXPECT_EQ(offered({"ls", "--sort", "r"}), (Strings{"rate", "readers"}));
+  EXPECT_EQ(offered({"top", "--sort", "r"}), (Strings{"rate", "readers", "reads", "rtt"}));
+  EXPECT_EQ(offered({"top", "--view", "p"}), Strings{"programs"});
   create("s");
   std::ofstream(daemon_.runtime_dir() + "/calibration") << "x";
   EXPECT_EQ(offered({"property", "set", "s", daemon_.runtime_dir() + "/cal"}),

@@ -72,6 +72,20 @@ TEST(CommandLine, TakesAPatternAfterTheHostsOfNodes) {
   EXPECT_EQ(options.pattern, "map*");
 }
 
+TEST(CommandLine, TakesForTopTheKeysOfItsView) {
+  const TopOptions options = options_of<TopOptions>(
+      {"top", "--view", "hosts", "--sort", "rtt", "-r", "--every", "250ms", "-n", "3", "pc*"});
+  EXPECT_EQ(options.view, TopView::hosts);
+  EXPECT_EQ(options.sort, "rtt");
+  EXPECT_TRUE(options.reverse);
+  EXPECT_EQ(options.interval, 250ms);
+  EXPECT_EQ(options.count, 3U);
+  EXPECT_EQ(options.pattern, "pc*");
+  EXPECT_NE(error_of({"top", "--sort", "rtt"}).find("'rtt' is not a key"), std::string::npos);
+  EXPECT_NE(error_of({"top", "--view", "all"}).find("there are streams, hosts and programs"),
+            std::string::npos);
+}
+
 TEST(CommandLine, TakesPatternsAfterTheOptionsOfRecord) {
   const RecordOptions options = options_of<RecordOptions>(
       {"record", "--host", "pc1", "-o", "f.mcap", "--past", "30s", "--max-file-size", "1.5GiB",

@@ -154,6 +154,28 @@ TEST(Table, HasNoLineBelowForAnEmptyCell) {
             "    down\n");
 }
 
+TEST(Table, HasLinesForAWindowOfItsRows) {
+  using Strings = std::vector<std::string>;
+  Table table = table_to_fit();
+  for (const char* name : {"a", "a long name", "b"}) table.add_row({name, "1", "2", "T", "-"});
+  EXPECT_EQ(table.rows(), 4U);
+  EXPECT_EQ(table.lines(80, 1, 2), (Strings{"NAME         ID  SIZE  TYPE               NOTE",
+                                            "a             1     2  T                  -",
+                                            "a long name   1     2  T                  -"}));
+  EXPECT_EQ(table.lines(30, 0, 1), (Strings{"NAME         TYPE", "odom         vehicle::Odometry"}))
+      << "without what is below";
+  EXPECT_EQ(table.lines(80, 3, 9).size(), 2U);
+  EXPECT_EQ(table.lines(80, 4, 9).size(), 1U);
+}
+
+TEST(Table, CutsTheWidestOfSeveralColumnsFirst) {
+  constexpr auto kCut = Table::Column::Fit::cut;
+  Table table({{"A", Table::Align::left, 0, kCut}, {"B", Table::Align::left, 0, kCut}});
+  table.add_row({"0123456789", "012345"});
+  EXPECT_EQ(on_terminal(14, table), "A       B\n012...  012345\n");
+  EXPECT_EQ(on_terminal(12, table), "A      B\n01...  01...\n");
+}
+
 TEST(Table, PrintsItsHeaderWithoutRows) {
   EXPECT_EQ(printed([&](Output& out) { Table({{"NAME"}, {"N"}}).print(out); }), "NAME  N\n");
 }
