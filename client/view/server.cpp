@@ -284,6 +284,8 @@ std::string Server::refusal(lws* connection) const {
 }
 
 int Server::on_event(lws* connection, int reason, void* user, void* in, std::size_t length) {
+  // `length`: whether OpenSSL accepts the certificate, which counts for nothing else.
+  if (reason == LWS_CALLBACK_OPENSSL_PERFORM_CLIENT_CERT_VERIFICATION) return length != 0 ? 0 : 1;
   auto& server = *static_cast<Server*>(lws_context_user(lws_get_context(connection)));
   const lws_protocols* protocol = lws_get_protocol(connection);
   if (reason == LWS_CALLBACK_EVENT_WAIT_CANCELLED) {  // comes once for each protocol
@@ -308,14 +310,14 @@ int Server::on_event(lws* connection, int reason, void* user, void* in, std::siz
   const bool is_http = std::strcmp(protocol->name, "http") == 0;
   const bool goes_on =
       is_http
-          ? server.on_http(connection, reason, *static_cast<std::uint64_t*>(user), in)
+          ? server.on_http(connection, reason, *static_cast<std::uint64_t*>(user))
           : server.on_websocket(connection, reason, *static_cast<WebSocket**>(user), in, length);
   return goes_on ? 0 : -1;
 }
 
 // --- texts
 
-bool Server::on_http(lws* connection, int reason, std::uint64_t& request, void* in) {
+bool Server::on_http(lws* connection, int reason, std::uint64_t& request) {
   switch (reason) {
     case LWS_CALLBACK_HTTP:
       return begin_text(connection, request, header(connection, WSI_TOKEN_GET_URI));

@@ -143,7 +143,7 @@ class Server {
 
   static int on_event(lws* connection, int reason, void* user, void* in, std::size_t length);
   // Of these, the result tells libwebsockets whether to end the connection.
-  bool on_http(lws* connection, int reason, std::uint64_t& request, void* in);
+  bool on_http(lws* connection, int reason, std::uint64_t& request);
   bool on_websocket(lws* connection, int reason, WebSocket*& socket, void* in, std::size_t length);
   bool begin_text(lws* connection, std::uint64_t& request, const std::string& path);
   bool write_text(lws* connection, Request& request);

@@ -133,11 +133,13 @@ TEST_F(ViewPage, DrawsScansPosesImagesAndBytes) {
     picture[i] = static_cast<std::byte>(i % kColumns + i / kColumns);
   }
   auto image =
-      session_.create_raw({"camera"}, TypeInfo{"", picture.size(), 1, {}}, depth_of(8)).value();
+      session_.create_raw({"camera", 0, ""}, TypeInfo{"", picture.size(), 1, {}}, depth_of(8))
+          .value();
   image.write(picture);
   const std::vector<std::byte> some = {std::byte{0xde}, std::byte{0xad}, std::byte{0xbe},
                                        std::byte{0xef}, std::byte{0}};
-  auto raw = session_.create_raw({"raw"}, TypeInfo{"", some.size(), 1, {}}, depth_of(8)).value();
+  auto raw =
+      session_.create_raw({"raw", 0, ""}, TypeInfo{"", some.size(), 1, {}}, depth_of(8)).value();
   raw.write(some);
   expect_ok("views", {"scan:0@pc1", "pose:0@pc1", "camera:0@pc1", "raw:0@pc1"});
 }

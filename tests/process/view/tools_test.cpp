@@ -39,7 +39,7 @@ TEST_F(ViewTools, ServeFoxglove) {
   }
   auto seen = session_.create<Seen>("seen", depth_of(8)).value();
   auto motion = on_pc2_.create<Motion>("motion:5", depth_of(8)).value();
-  auto plain = session_.create_raw({"plain"}, TypeInfo{"", 3, 1, {}}, depth_of(8)).value();
+  auto plain = session_.create_raw({"plain", 0, ""}, TypeInfo{"", 3, 1, {}}, depth_of(8)).value();
   seen.write({true, {{1, 2.5, 3}, {4, 5.5, 6}}, {7, 8, 9}, -10, 11}, at_ns(1'234'567'890'123));
   motion.write({0.5, {1, 2, 3}, -4}, at_ns(42));
   const std::vector<std::byte> bytes = {std::byte{7}, std::byte{0}, std::byte{255}};

@@ -172,7 +172,7 @@ TEST_F(View, SaysSoWhileDssmdIsGone) {
 
 TEST_F(View, GivesTheTypeAndTheFields) {
   auto motion = session_.create<Motion>("motion", depth_of(8)).value();
-  auto plain = session_.create_raw({"plain"}, TypeInfo{"", 5, 1, {}}, depth_of(8)).value();
+  auto plain = session_.create_raw({"plain", 0, ""}, TypeInfo{"", 5, 1, {}}, depth_of(8)).value();
   const Json type = ask({{"op", "type"}, {"stream", "motion:0@pc1"}});
   EXPECT_EQ(type["status"], "ok");
   EXPECT_EQ(type["name"], "Motion");
@@ -271,7 +271,8 @@ TEST_F(View, FollowsAStreamThatIsCreatedAgain) {
 // --- clients that do not read
 
 TEST_F(View, DelaysNobodyForABrowserThatStands) {
-  auto images = session_.create_raw({"image"}, TypeInfo{"", 1 << 20, 1, {}}, depth_of(8)).value();
+  auto images =
+      session_.create_raw({"image", 0, ""}, TypeInfo{"", 1 << 20, 1, {}}, depth_of(8)).value();
   const std::vector<std::byte> image(1 << 20);
   await([&] { return ask({{"op", "overview"}})["streams"].size() == 1; });
   Running client(
