@@ -8,11 +8,14 @@
 #include <signal.h>
 
 #include <CLI/CLI.hpp>
+#include <algorithm>
 #include <cstdio>
 #include <dssm/session.hpp>
 #include <string>
 #include <utility>
+#include <vector>
 
+#include "client/dssmctl/config_words.hpp"
 #include "client/dssmctl/metrics.hpp"
 #include "client/dssmctl/text.hpp"
 #include "client/view/foxglove.hpp"
@@ -119,6 +122,11 @@ Result<void> serve(Options options) {
   return {};
 }
 
+int report(const Error& error) {
+  std::fputs(fmt::format("dssm-view: {}\n", ctl::escaped_message(error.message)).c_str(), stderr);
+  return error.code == Errc::invalid_argument ? kWrongUsage : kFailure;
+}
+
 int main_program(int argc, char** argv) {
   Options options;
   ServerOptions& server = options.server;
@@ -149,8 +157,21 @@ int main_program(int argc, char** argv) {
                  "A server whose pages may connect, as https://app.foxglove.dev")
       ->type_name("URL");
   app.add_option("--pages", server.pages, "The folder with the page")->type_name("FOLDER");
+  std::string config;
+  app.add_option("--config", config,
+                 "A TOML file with options as keys, before those of the command line")
+      ->type_name("FILE");
   try {
     app.parse(argc, argv);
+    if (!config.empty()) {
+      std::vector<std::string> words(argv + 1, argv + argc);
+      const Result<std::vector<std::string>> configured = ctl::config_words(config);
+      if (!configured) return report(configured.error());
+      words.insert(words.begin(), configured->begin(), configured->end());
+      std::ranges::reverse(words);  // as CLI11 takes them
+      app.clear();
+      app.parse(std::move(words));
+    }
   } catch (const CLI::ParseError& error) {
     return app.exit(error) == 0 ? kSuccess : kWrongUsage;
   }
@@ -159,10 +180,7 @@ int main_program(int argc, char** argv) {
     return kWrongUsage;
   }
   const Result<void> served = serve(std::move(options));
-  if (served) return kSuccess;
-  std::fputs(fmt::format("dssm-view: {}\n", ctl::escaped_message(served.error().message)).c_str(),
-             stderr);
-  return served.error().code == Errc::invalid_argument ? kWrongUsage : kFailure;
+  return served ? kSuccess : report(served.error());
 }
 
 }  // namespace

@@ -34,7 +34,7 @@ PACKAGES = (
     " python3 python3-apt"
     # What the project's packages and the example depend on.
     " libstdc++6 libevent-core-2.1-7 libfmt9 libprotobuf-lite32 libsystemd0 libavahi-client3"
-    " libavahi-common3 libtomlplusplus3 libdeflate0 liblz4-1 libzstd1 libdw1 zlib1g libpng16-16 adduser"
+    " libavahi-common3 libtomlplusplus3 libdeflate0 liblz4-1 libzstd1 libdw1 libwebsockets17 zlib1g libpng16-16 adduser"
     " init-system-helpers"
 ).split()
 
