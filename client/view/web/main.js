@@ -332,8 +332,8 @@ function parsed(text) {
   }
 }
 
-function readUrl() {
-  const state = new URLSearchParams(location.hash.slice(1));
+function readUrl(hash) {
+  const state = new URLSearchParams(hash.slice(1));
   const signalsState = parsed(state.get("signals"));
   if (signalsState) {
     chosen.signals = signals.suggested = true;
@@ -363,7 +363,8 @@ for (const event of ["mode", "change"]) {
     () => (time.mode === "hold" || event === "mode") && time.hover === null && writeUrl(),
   );
 }
-window.addEventListener("hashchange", readUrl);
+// The event's URL: writeUrl() may have changed the present one since.
+window.addEventListener("hashchange", (event) => readUrl(new URL(event.newURL).hash));
 
 // --- dark and light ------------------------------------------------------------------------------
 
@@ -446,5 +447,5 @@ for (const dialog of document.querySelectorAll("dialog")) {
 find("show-keys").addEventListener("click", toggleKeys);
 
 showTheme(storedTheme());
-readUrl();
+readUrl(location.hash);
 overviewPump.wake();
