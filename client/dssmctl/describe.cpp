@@ -30,6 +30,8 @@ std::string note(const HostInfo& host) {
   return text;
 }
 
+}  // namespace
+
 Json mirror_json(const MirrorInfo& mirror) {
   return {{"state", name_of(mirror.state)},
           {"newest_tid", mirror.newest != kNoTid ? Json(mirror.newest) : Json()},
@@ -48,8 +50,6 @@ Json mirror_json(const MirrorInfo& mirror) {
           {"clock", or_null(mirror.clock)},
           {"error", or_null(mirror.error)}};
 }
-
-}  // namespace
 
 bool is_good(const ClockSnapshot& clock) {
   return clock.status == ClockStatus::synchronized || clock.status == ClockStatus::holdover;

@@ -48,6 +48,9 @@ std::string count_text(const StreamInfo& stream, std::uint32_t users);
 void print_fields(const TypeInfo& type, Output& out);
 Json fields_json(const TypeInfo& type);
 
+// How this PC's mirror of a stream is doing.
+Json mirror_json(const MirrorInfo& mirror);
+
 // What `info` adds: fields, users, and how the mirror is doing.
 void add_details(Json& json, const StreamInfo& stream);
 

@@ -36,6 +36,7 @@ Json streams_json(const std::vector<StreamInfo>& streams, Json& range) {
     Json json = ctl::stream_json(stream);
     json["oldest_ns"] = oldest ? time_json(*oldest) : Json();
     json["newest_ns"] = oldest ? time_json(stream.newest_time) : Json();
+    json["mirror"] = stream.mirror ? ctl::mirror_json(*stream.mirror) : Json();
     list.push_back(std::move(json));
     if (!oldest) continue;
     first = std::min(first.value_or(*oldest), *oldest);
@@ -112,6 +113,14 @@ Result<void> StateCollector::collect(bool all) {
   for (const NodeInfo& node : state_.nodes) json["nodes"].push_back(ctl::node_json(node));
   if (MonoClock::now() < next_findings_) return {};
   next_findings_ = deadline_in(kFindingsPeriod);
+  json["clock_limit_ns"] = Json();
+  if (const auto pairs = session_.list_clock_pairs(); pairs) {
+    for (const ClockPair& pair : *pairs) {
+      if (pair.reader == daemon.host && pair.limit > Duration()) {
+        json["clock_limit_ns"] = to_ns(pair.limit);
+      }
+    }
+  }
   ctl::CommonOptions options;
   options.socket_path = socket_path_;
   options.verb_name = "doctor";

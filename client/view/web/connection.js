@@ -3,9 +3,9 @@
 // The WebSocket to dssm-view. The page asks and dssm-view answers, in order. A lost connection is
 // reopened each second.
 //
-// A Pump repeats one kind of request: at most one is under way, the next follows when the answer has
-// come, and none while the tab is hidden or the connection is lost. So a slow browser or network
-// gets fewer updates, not later ones.
+// A Pump repeats one kind of request: at most one is under way, the next follows when the answer
+// has come, and none while the tab is hidden or the connection is lost. So a slow browser or
+// network gets fewer updates, not later ones.
 
 const kProtocol = "dssm.view.v1";
 const kRetryMs = 1000;
@@ -115,8 +115,8 @@ export class Connection extends EventTarget {
 }
 
 export class Pump {
-  // ask: an async function; it returns the milliseconds until it is to be called again, or null when
-  // it waits for wake(). Calls begin at least `periodMs` apart.
+  // ask: an async function; it returns the milliseconds until it is to be called again, or null
+  // when it waits for wake(). Calls begin at least `periodMs` apart.
   constructor(connection, periodMs, ask) {
     this.connection = connection;
     this.periodMs = periodMs;

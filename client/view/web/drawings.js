@@ -4,7 +4,7 @@
 import { imageSize, isFloat, isNumeric, numberOf, textOf, unitOf, valueOf } from "./fields.js";
 import { cssColor, element, number, setText } from "./format.js";
 
-// --- the plane --------------------------------------------------------------------------------------
+// --- the plane -----------------------------------------------------------------------------------
 
 const kMinScale = 0.5; // CSS pixels per metre
 const kMaxScale = 2000;
@@ -32,18 +32,25 @@ export class PlaneView {
 
   listen() {
     const { canvas } = this;
-    canvas.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      if (this.scale === null) return;
-      const factor = kWheelStep ** -event.deltaY;
-      const scale = Math.min(kMaxScale, Math.max(kMinScale, this.scale * factor));
-      const [u, v] = [event.offsetX - canvas.clientWidth / 2, canvas.clientHeight / 2 - event.offsetY];
-      this.center[0] += u / this.scale - u / scale;
-      this.center[1] += v / this.scale - v / scale;
-      this.scale = scale;
-      this.fitted = false;
-      this.redraw();
-    }, { passive: false });
+    canvas.addEventListener(
+      "wheel",
+      (event) => {
+        event.preventDefault();
+        if (this.scale === null) return;
+        const factor = kWheelStep ** -event.deltaY;
+        const scale = Math.min(kMaxScale, Math.max(kMinScale, this.scale * factor));
+        const [u, v] = [
+          event.offsetX - canvas.clientWidth / 2,
+          canvas.clientHeight / 2 - event.offsetY,
+        ];
+        this.center[0] += u / this.scale - u / scale;
+        this.center[1] += v / this.scale - v / scale;
+        this.scale = scale;
+        this.fitted = false;
+        this.redraw();
+      },
+      { passive: false },
+    );
     canvas.addEventListener("pointerdown", (event) => canvas.setPointerCapture(event.pointerId));
     canvas.addEventListener("pointermove", (event) => {
       if (!canvas.hasPointerCapture(event.pointerId) || this.scale === null) return;
@@ -77,7 +84,8 @@ export class PlaneView {
     let step = fields.step ? numberOf(payload, fields.step) * unitOf(fields.step) : null;
     const last = fields.last ? numberOf(payload, fields.last) * unitOf(fields.last) : null;
     const known = first !== null && (step !== null || last !== null);
-    if (first !== null && step === null && last !== null) step = (last - first) / Math.max(1, count - 1);
+    if (first !== null && step === null && last !== null)
+      step = (last - first) / Math.max(1, count - 1);
     if (!known) {
       first = -Math.PI;
       step = (2 * Math.PI) / Math.max(1, count);
@@ -91,7 +99,12 @@ export class PlaneView {
       angles.push(first + i * step);
       ranges.push(range);
     }
-    const note = count === 0 ? "A scan without beams" : known ? "" : "The type has no angles: a full turn is assumed";
+    const note =
+      count === 0
+        ? "A scan without beams"
+        : known
+          ? ""
+          : "The type has no angles: a full turn is assumed";
     return { angles, ranges, note };
   }
 
@@ -115,7 +128,7 @@ export class PlaneView {
   pointsOf(scan, pose) {
     const x0 = pose?.x ?? 0;
     const y0 = pose?.y ?? 0;
-    const turn = pose ? pose.theta ?? 0 : Math.PI / 2;
+    const turn = pose ? (pose.theta ?? 0) : Math.PI / 2;
     return scan.ranges.map((range, i) => {
       const angle = turn + scan.angles[i];
       return [x0 + range * Math.cos(angle), y0 + range * Math.sin(angle)];
@@ -147,7 +160,10 @@ export class PlaneView {
     const around = xs.length === 0 || !scan ? kMargin : 0;
     xs.push(here.x - around, here.x + around);
     ys.push(here.y - around, here.y + around);
-    const bound = (list) => [list.reduce((a, b) => Math.min(a, b)), list.reduce((a, b) => Math.max(a, b))];
+    const bound = (list) => [
+      list.reduce((a, b) => Math.min(a, b)),
+      list.reduce((a, b) => Math.max(a, b)),
+    ];
     return { x: bound(xs), y: bound(ys) };
   }
 
@@ -167,8 +183,8 @@ export class PlaneView {
     if (content.pose || content.scan) this.drawRobot(draw, content.pose, toX, toY);
   }
 
-  // Moves and zooms only when the content leaves the picture, or has become small in it, so that the
-  // picture does not jitter.
+  // Moves and zooms only when the content leaves the picture, or has become small in it, so that
+  // the picture does not jitter.
   applyFit({ x, y }) {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const spanX = Math.max(x[1] - x[0], 0.1);
@@ -176,8 +192,8 @@ export class PlaneView {
     const scale = Math.min(kMaxScale, (kFill * width) / spanX, (kFill * height) / spanY);
     const kSmall = 1.6;
     if (this.scale !== null && scale < this.scale * kSmall) {
-      const inside = (range, center, size) => range[0] >= center - size / 2 / this.scale &&
-        range[1] <= center + size / 2 / this.scale;
+      const inside = (range, center, size) =>
+        range[0] >= center - size / 2 / this.scale && range[1] <= center + size / 2 / this.scale;
       if (inside(x, this.center[0], width) && inside(y, this.center[1], height)) return;
     }
     this.scale = scale / 1.1;
@@ -193,8 +209,14 @@ export class PlaneView {
     draw.strokeStyle = cssColor("--grid");
     draw.lineWidth = 1;
     draw.beginPath();
-    const [left, right] = [this.center[0] - width / 2 / this.scale, this.center[0] + width / 2 / this.scale];
-    const [low, high] = [this.center[1] - height / 2 / this.scale, this.center[1] + height / 2 / this.scale];
+    const [left, right] = [
+      this.center[0] - width / 2 / this.scale,
+      this.center[0] + width / 2 / this.scale,
+    ];
+    const [low, high] = [
+      this.center[1] - height / 2 / this.scale,
+      this.center[1] + height / 2 / this.scale,
+    ];
     for (let i = Math.ceil(left / step); i * step <= right; ++i) {
       const u = Math.round(toX(i * step)) + 0.5;
       draw.moveTo(u, 0);
@@ -274,7 +296,7 @@ export class PlaneView {
   }
 }
 
-// --- images -----------------------------------------------------------------------------------------
+// --- images --------------------------------------------------------------------------------------
 
 const kMaxPixels = 64 * 1024 * 1024;
 
@@ -290,8 +312,13 @@ export class ImageView {
 
   show({ payload }, note) {
     const offset = this.layout?.offset ?? 0;
-    const bytes = new Uint8Array(payload.buffer, payload.byteOffset + offset, payload.byteLength - offset);
-    if (bytes[0] === 0xff && bytes[1] === 0xd8 && bytes[2] === 0xff) return this.showJpeg(bytes, note);
+    const bytes = new Uint8Array(
+      payload.buffer,
+      payload.byteOffset + offset,
+      payload.byteLength - offset,
+    );
+    if (bytes[0] === 0xff && bytes[1] === 0xd8 && bytes[2] === 0xff)
+      return this.showJpeg(bytes, note);
     const size = this.sizeOf(payload, bytes);
     if (!size) return note("The size of the image is not known");
     const { columns, rows, channels } = size;
@@ -324,13 +351,16 @@ export class ImageView {
 
   showJpeg(bytes, note) {
     const number = ++this.newest;
-    createImageBitmap(new Blob([bytes], { type: "image/jpeg" })).then((bitmap) => {
-      if (number !== this.newest) return;
-      this.setSize(bitmap.width, bitmap.height);
-      this.canvas.getContext("2d").drawImage(bitmap, 0, 0);
-      note(`${bitmap.width} \u00d7 ${bitmap.height}, JPEG`);
-      bitmap.close();
-    }, () => number === this.newest && note("The JPEG image cannot be decoded"));
+    createImageBitmap(new Blob([bytes], { type: "image/jpeg" })).then(
+      (bitmap) => {
+        if (number !== this.newest) return;
+        this.setSize(bitmap.width, bitmap.height);
+        this.canvas.getContext("2d").drawImage(bitmap, 0, 0);
+        note(`${bitmap.width} \u00d7 ${bitmap.height}, JPEG`);
+        bitmap.close();
+      },
+      () => number === this.newest && note("The JPEG image cannot be decoded"),
+    );
   }
 
   setSize(columns, rows) {
@@ -339,7 +369,7 @@ export class ImageView {
   }
 }
 
-// --- fields and bytes -------------------------------------------------------------------------------
+// --- fields and bytes ----------------------------------------------------------------------------
 
 const kShownElements = 12;
 
@@ -348,12 +378,26 @@ export class TableView {
     this.rows = type.fields.map((field) => {
       const value = element("td", { class: field.count === 1 ? "number" : "list" });
       const kind = field.count === 1 ? field.kind : `${field.kind}[${field.count}]`;
-      const row = element("tr", { "data-field": field.name },
-        element("th", { scope: "row" }, field.name), value, element("td", { class: "kind" }, kind));
+      const row = element(
+        "tr",
+        { "data-field": field.name },
+        element("th", { scope: "row" }, field.name),
+        value,
+        element("td", { class: "kind" }, kind),
+      );
       return { field, value, row };
     });
-    box.append(element("div", { class: "scroll" }, element("table", { class: "fields" },
-      element("tbody", {}, ...this.rows.map((one) => one.row)))));
+    box.append(
+      element(
+        "div",
+        { class: "scroll" },
+        element(
+          "table",
+          { class: "fields" },
+          element("tbody", {}, ...this.rows.map((one) => one.row)),
+        ),
+      ),
+    );
   }
 
   show({ payload }) {
@@ -372,7 +416,8 @@ export class TableView {
   elementText(payload, field, index) {
     const value = valueOf(payload, field, index);
     if (value === undefined) return "\u2013";
-    if (field.kind === "float32" && isNumeric(field) && isFloat(field)) return number(Number(value.toPrecision(7)));
+    if (field.kind === "float32" && isNumeric(field) && isFloat(field))
+      return number(Number(value.toPrecision(7)));
     return number(value);
   }
 }

@@ -3,8 +3,18 @@
 // Types of streams: their fields, values in payloads, and which view fits a type.
 
 const kSizes = {
-  bool: 1, char: 1, int8: 1, uint8: 1, int16: 2, uint16: 2, int32: 4, uint32: 4, int64: 8, uint64: 8,
-  float32: 4, float64: 8,
+  bool: 1,
+  char: 1,
+  int8: 1,
+  uint8: 1,
+  int16: 2,
+  uint16: 2,
+  int32: 4,
+  uint32: 4,
+  int64: 8,
+  uint64: 8,
+  float32: 4,
+  float64: 8,
 };
 
 export function isNumeric(field) {
@@ -37,19 +47,31 @@ export function valueOf(payload, field, index = 0) {
 
 function rawValue(payload, kind, at) {
   switch (kind) {
-    case "bool": return payload.getUint8(at) !== 0;
+    case "bool":
+      return payload.getUint8(at) !== 0;
     case "char":
-    case "uint8": return payload.getUint8(at);
-    case "int8": return payload.getInt8(at);
-    case "uint16": return payload.getUint16(at, true);
-    case "int16": return payload.getInt16(at, true);
-    case "uint32": return payload.getUint32(at, true);
-    case "int32": return payload.getInt32(at, true);
-    case "uint64": return payload.getBigUint64(at, true);
-    case "int64": return payload.getBigInt64(at, true);
-    case "float32": return payload.getFloat32(at, true);
-    case "float64": return payload.getFloat64(at, true);
-    default: return undefined;
+    case "uint8":
+      return payload.getUint8(at);
+    case "int8":
+      return payload.getInt8(at);
+    case "uint16":
+      return payload.getUint16(at, true);
+    case "int16":
+      return payload.getInt16(at, true);
+    case "uint32":
+      return payload.getUint32(at, true);
+    case "int32":
+      return payload.getInt32(at, true);
+    case "uint64":
+      return payload.getBigUint64(at, true);
+    case "int64":
+      return payload.getBigInt64(at, true);
+    case "float32":
+      return payload.getFloat32(at, true);
+    case "float64":
+      return payload.getFloat64(at, true);
+    default:
+      return undefined;
   }
 }
 
@@ -78,26 +100,45 @@ export function findField(type, name) {
   return field && Number(parts[2]) < field.count ? { field, index: Number(parts[2]) } : null;
 }
 
-// --- which view fits ------------------------------------------------------------------------------
+// --- which view fits -----------------------------------------------------------------------------
 
 const kMinBeams = 32;
 const kImageSizes = [
-  [160, 120], [320, 240], [640, 480], [800, 600], [1024, 768], [1280, 720], [1280, 960],
-  [1280, 1024], [1600, 1200], [1920, 1080], [1920, 1200], [2048, 1536], [2592, 1944], [3840, 2160],
+  [160, 120],
+  [320, 240],
+  [640, 480],
+  [800, 600],
+  [1024, 768],
+  [1280, 720],
+  [1280, 960],
+  [1280, 1024],
+  [1600, 1200],
+  [1920, 1080],
+  [1920, 1200],
+  [2048, 1536],
+  [2592, 1944],
+  [3840, 2160],
 ];
 const scalar = (field) => field.count === 1 && isNumeric(field);
 
 // The fields of a scan: {ranges, beams?, first?, step?, last?}; null when the type is not one.
 export function scanOf(type) {
-  const ranges = type.fields.find((field) =>
-    field.count >= kMinBeams && isNumeric(field) && /^(ranges?|r|distances?)$/.test(plainName(field)));
+  const ranges = type.fields.find(
+    (field) =>
+      field.count >= kMinBeams &&
+      isNumeric(field) &&
+      /^(ranges?|r|distances?)$/.test(plainName(field)),
+  );
   if (!ranges) return null;
-  const find = (pattern) => type.fields.find((field) => scalar(field) && pattern.test(plainName(field)));
+  const find = (pattern) =>
+    type.fields.find((field) => scalar(field) && pattern.test(plainName(field)));
   return {
     ranges,
     beams: find(/^(beams|num_?beams|n|count|size|num|num_?points|beam_?count)$/),
     first: find(/^(first|start|first_?angle|start_?angle|angle_?(min|start|first)|min_?angle)$/),
-    step: find(/^(step|increment|angle_?(step|increment|resolution)|resolution|angular_?resolution)$/),
+    step: find(
+      /^(step|increment|angle_?(step|increment|resolution)|resolution|angular_?resolution)$/,
+    ),
     last: find(/^(last|end|last_?angle|end_?angle|angle_?(max|end|last)|max_?angle)$/),
   };
 }
@@ -111,22 +152,31 @@ export function unitOf(field) {
 
 // The fields of a pose: {x, y, theta?}; null when the type is not one.
 export function poseOf(type) {
-  const find = (pattern) => type.fields.find((field) => scalar(field) && pattern.test(plainName(field)));
+  const find = (pattern) =>
+    type.fields.find((field) => scalar(field) && pattern.test(plainName(field)));
   const x = find(/^(x|px|pos_?x)$/);
   const y = find(/^(y|py|pos_?y)$/);
   const theta = find(/^(theta|yaw|heading|th|phi|a|angle)$/);
   return x && y ? { x, y, theta } : null;
 }
 
-// The fields of an image, {data, width, height, channels?}, for a described type; or of known bytes,
-// {offset, size, sizes}, when the payload's size is that of an image; null when it is not one.
+// Of an image: the fields {data, width, height, channels?} of a described type; or {columns, rows,
+// channels} when a number of bytes is that of a common picture; both with {offset} of the first
+// byte. Null when the type is not an image.
 export function imageOf(type) {
   const data = type.fields.find((field) => field.kind === "uint8" && field.count >= 256);
-  const find = (pattern) => type.fields.find((field) => scalar(field) && pattern.test(plainName(field)));
+  const find = (pattern) =>
+    type.fields.find((field) => scalar(field) && pattern.test(plainName(field)));
   const width = find(/^(width|w|cols|columns)$/);
   const height = find(/^(height|h|rows)$/);
   if (data && width && height) {
-    return { data, width, height, channels: find(/^(channels|depth|components)$/), offset: data.offset_bytes };
+    return {
+      data,
+      width,
+      height,
+      channels: find(/^(channels|depth|components)$/),
+      offset: data.offset_bytes,
+    };
   }
   if (type.fields.length > 0 && !data) return null;
   const size = data ? data.count : type.payload_bytes;

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The graph of programs and streams as SVG, in layers: an arrow goes from a writer to its stream and
-// from there to each reader, dashed where the two are on different hosts. In a narrow window the
-// layers are below each other.
+// The graph of programs and streams as SVG, in layers: an arrow goes from a writer to its stream
+// and from there to each reader, dashed where the two are on different hosts. In a narrow window
+// the layers are below each other.
 
 const kSvg = "http://www.w3.org/2000/svg";
 const kBoxWidth = 148;
@@ -15,23 +15,39 @@ const kNarrow = 560;
 const kMaxText = 20;
 const kNarrowBoxWidth = 104;
 const kNarrowMaxText = 13;
+const kBackBend = 22; // of an arrow to an earlier layer, which passes beside the boxes
 const kWay = 12; // what a long arrow takes up in the layers that it passes
 
 // nodes: of `overview`; width: the place for the drawing, in CSS pixels.
 export function drawGraph(streams, nodes, width) {
   const boxes = boxesOf(streams, nodes);
   const down = width < kNarrow;
-  const shape = { down, width: down ? kNarrowBoxWidth : kBoxWidth, text: down ? kNarrowMaxText : kMaxText };
+  const shape = {
+    down,
+    width: down ? kNarrowBoxWidth : kBoxWidth,
+    text: down ? kNarrowMaxText : kMaxText,
+  };
   const layers = layersOf(boxes);
   const arrows = arrowsOf(layers, boxes);
   const size = place(order(layers, boxes), shape);
+  if (arrows.some(isBack)) size[down ? "width" : "height"] += kBackBend;
   const svg = make("svg", {
-    viewBox: `0 0 ${size.width} ${size.height}`, width: size.width, height: size.height,
-    role: "img", "aria-label": describe(arrows),
+    viewBox: `0 0 ${size.width} ${size.height}`,
+    width: size.width,
+    height: size.height,
+    role: "img",
+    "aria-label": describe(arrows),
   });
   const defs = make("defs", {});
-  const head = make("marker", { id: "arrow", viewBox: "0 0 8 8", refX: 7, refY: 4, markerWidth: 7,
-    markerHeight: 7, orient: "auto-start-reverse" });
+  const head = make("marker", {
+    id: "arrow",
+    viewBox: "0 0 8 8",
+    refX: 7,
+    refY: 4,
+    markerWidth: 7,
+    markerHeight: 7,
+    orient: "auto-start-reverse",
+  });
   head.append(make("path", { d: "M0 0.5 L7.5 4 L0 7.5 z", class: "arrow-head" }));
   defs.append(head);
   svg.append(defs);
@@ -44,7 +60,8 @@ export function drawGraph(streams, nodes, width) {
 function boxesOf(streams, nodes) {
   const boxes = new Map();
   const add = (key, kind, title, host, level) => {
-    if (!boxes.has(key)) boxes.set(key, { key, kind, title, host, level, to: new Set(), from: new Set() });
+    if (!boxes.has(key))
+      boxes.set(key, { key, kind, title, host, level, to: new Set(), from: new Set() });
     return boxes.get(key);
   };
   for (const stream of streams) {
@@ -60,7 +77,13 @@ function boxesOf(streams, nodes) {
     const program = add(key, "program", node.program ?? `pid ${node.pid}`, node.host, "");
     const streamOf = (use) => {
       const [, name, host] = /^(.*?)(?:@(.*))?$/.exec(use.stream);
-      return add(`stream ${use.stream}`, "stream", name.replace(/:0$/, ""), host ?? node.host, "unknown");
+      return add(
+        `stream ${use.stream}`,
+        "stream",
+        name.replace(/:0$/, ""),
+        host ?? node.host,
+        "unknown",
+      );
     };
     for (const use of node.writes ?? []) link(program, streamOf(use));
     for (const use of node.reads ?? []) link(streamOf(use), program);
@@ -97,8 +120,15 @@ function arrowsOf(layers, boxes) {
     for (const key of [...box.to]) {
       const to = boxes.get(key);
       const ways = [box];
+      box.layer = layerOf.get(box.key);
+      to.layer = layerOf.get(key);
       for (let i = layerOf.get(box.key) + 1; i < layerOf.get(key); ++i) {
-        const way = { key: `way ${box.key} ${key} ${i}`, kind: "way", to: new Set(), from: new Set() };
+        const way = {
+          key: `way ${box.key} ${key} ${i}`,
+          kind: "way",
+          to: new Set(),
+          from: new Set(),
+        };
         boxes.set(way.key, way);
         layers[i].push(way.key);
         ways.push(way);
@@ -155,14 +185,28 @@ function place(layers, { down, width }) {
     }
   });
   const length = Math.max(0, layers.length * (along + gap) - gap) + 2 * kMargin;
-  return down ? { width: most + 2 * kMargin, height: length }
+  return down
+    ? { width: most + 2 * kMargin, height: length }
     : { width: length, height: most + 2 * kMargin };
+}
+
+// A program that reads what it has caused: the arrow closes a circle.
+function isBack(ways) {
+  return ways.at(-1).layer <= ways[0].layer;
+}
+
+function backPath(from, to, { down, width }) {
+  const side = (box) =>
+    down ? [box.x + width, box.y + kBoxHeight / 2] : [box.x + width / 2, box.y + kBoxHeight];
+  const bent = ([x, y]) => (down ? [x + kBackBend * 1.2, y] : [x, y + kBackBend * 1.2]);
+  return `M${side(from)} C${bent(side(from))} ${bent(side(to))} ${side(to)}`;
 }
 
 function drawArrow(ways, { down, width }) {
   const bend = (down ? kLayerGap / 2 : kLayerGap) * 0.6;
   const middle = (box) => (box.kind === "way" ? kWay : down ? width : kBoxHeight) / 2;
-  const out = (box) => (down ? [box.x + middle(box), box.y + kBoxHeight] : [box.x + width, box.y + middle(box)]);
+  const out = (box) =>
+    down ? [box.x + middle(box), box.y + kBoxHeight] : [box.x + width, box.y + middle(box)];
   const into = (box) => (down ? [box.x + middle(box), box.y] : [box.x, box.y + middle(box)]);
   let path = `M${out(ways[0])}`;
   for (let i = 0; i + 1 < ways.length; ++i) {
@@ -175,24 +219,43 @@ function drawArrow(ways, { down, width }) {
   }
   const from = ways[0];
   const to = ways.at(-1);
+  if (isBack(ways)) path = backPath(from, to, { down, width });
   return make("path", {
-    d: path, class: from.host !== to.host ? "edge remote" : "edge",
-    "marker-end": "url(#arrow)", "data-from": from.key, "data-to": to.key,
+    d: path,
+    class: from.host !== to.host ? "edge remote" : "edge",
+    "marker-end": "url(#arrow)",
+    "data-from": from.key,
+    "data-to": to.key,
   });
 }
 
 function drawBox(box, { width, text }) {
-  const group = make("g", { class: `box ${box.kind}`, "data-level": box.level, "data-key": box.key });
+  const group = make("g", {
+    class: `box ${box.kind}`,
+    "data-level": box.level,
+    "data-key": box.key,
+  });
   const full = make("title", {});
   full.textContent = `${box.kind} ${box.title} on ${box.host}${box.level ? `, ${box.level}` : ""}`;
   const middle = box.x + width / 2;
   const title = make("text", { x: middle, y: box.y + 17, class: "title" });
   title.textContent = shortened(box.title, text);
   const host = make("text", { x: middle, y: box.y + 31, class: "at" });
-  const state = box.level && box.level !== "live" && box.level !== "unknown" ? `, ${box.level}` : "";
+  const state =
+    box.level && box.level !== "live" && box.level !== "unknown" ? `, ${box.level}` : "";
   host.textContent = shortened(`@${box.host}${state}`, text);
-  group.append(full, make("rect", { x: box.x, y: box.y, width, height: kBoxHeight,
-    rx: box.kind === "stream" ? kBoxHeight / 2 : 3 }), title, host);
+  group.append(
+    full,
+    make("rect", {
+      x: box.x,
+      y: box.y,
+      width,
+      height: kBoxHeight,
+      rx: box.kind === "stream" ? kBoxHeight / 2 : 3,
+    }),
+    title,
+    host,
+  );
   return group;
 }
 

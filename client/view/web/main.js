@@ -25,7 +25,7 @@ const connection = new Connection(`${scheme}://${location.host}/`);
 const time = new Time();
 let overview = null; // the last answer
 
-// --- types of streams -------------------------------------------------------------------------------
+// --- types of streams ----------------------------------------------------------------------------
 
 // The types that were asked for. A recreated stream may have another one.
 class Types {
@@ -40,16 +40,23 @@ class Types {
   // Null when it cannot be had.
   ask(stream) {
     const entry = this.known.get(stream);
-    if (entry && (entry.type || performance.now() - entry.failedAt < kTypeRetryMs)) return entry.promise;
+    if (entry && (entry.type || performance.now() - entry.failedAt < kTypeRetryMs))
+      return entry.promise;
     const made = { type: null, failedAt: Infinity, incarnation: incarnationOf(stream) };
     this.known.set(stream, made);
     made.promise = this.request(stream).then(
-      (answer) => (made.type = { fields: answer.fields ?? [], payload_bytes: answer.payload_bytes, name: answer.name }),
+      (answer) =>
+        (made.type = {
+          fields: answer.fields ?? [],
+          payload_bytes: answer.payload_bytes,
+          name: answer.name,
+        }),
       (error) => {
         if (!(error instanceof RequestError || error instanceof LostError)) throw error;
         made.failedAt = error instanceof LostError ? -Infinity : performance.now();
         return null;
-      });
+      },
+    );
     return made.promise;
   }
 
@@ -77,7 +84,7 @@ function streams() {
   return overview?.streams ?? [];
 }
 
-// --- the pages --------------------------------------------------------------------------------------
+// --- the pages -----------------------------------------------------------------------------------
 
 const types = new Types();
 const parts = { connection, time, types, streams };
@@ -127,17 +134,21 @@ for (const [i, button] of tabs.entries()) {
   });
 }
 
-// --- requests ---------------------------------------------------------------------------------------
+// --- requests ------------------------------------------------------------------------------------
 
 const overviewPump = new Pump(connection, kOverviewMs, async () => {
   const first = overview === null;
   overview = complete(await connection.request("overview"));
-  const range = overview.range && { oldest: BigInt(overview.range.oldest_ns), newest: BigInt(overview.range.newest_ns) };
+  const range = overview.range && {
+    oldest: BigInt(overview.range.oldest_ns),
+    newest: BigInt(overview.range.newest_ns),
+  };
   time.setRange(range, overview.recording !== null);
   types.forgetRecreated();
-  setText(find("host"), overview.recording ? overview.recording.file : overview.host);
+  const name = overview.recording?.file ?? overview.host;
+  setText(find("host"), name);
   find("host").title = `dssm-view ${overview.version}`;
-  document.title = `${overview.recording ? overview.recording.file : overview.host} \u2013 DSSM view`;
+  document.title = `${name} \u2013 DSSM view`;
   overviewPage.show(overview);
   views.showStreams();
   if (page() && (first || !page().suggested)) page().open();
@@ -161,7 +172,11 @@ const atPump = new Pump(connection, kAtMs, async () => {
   const t = time.instant();
   let answer;
   try {
-    answer = await connection.request("at", { streams: wanted, t_ns: t === null ? null : String(t), payloads: true });
+    answer = await connection.request("at", {
+      streams: wanted,
+      t_ns: t === null ? null : String(t),
+      payloads: true,
+    });
   } catch (error) {
     if (!(error instanceof RequestError)) throw error;
     shown.showSamples(t ?? 0n, new Map(wanted.map((stream) => [stream, failed(error.message)])));
@@ -195,7 +210,10 @@ function sampleOf(one, answer) {
     error: one.error ?? "",
     tid: one.tid ?? null,
     timeNs: one.time_ns === undefined || one.time_ns === null ? null : BigInt(one.time_ns),
-    clockErrorNs: one.clock_error_ns === undefined || one.clock_error_ns === null ? null : BigInt(one.clock_error_ns),
+    clockErrorNs:
+      one.clock_error_ns === undefined || one.clock_error_ns === null
+        ? null
+        : BigInt(one.clock_error_ns),
     payload: has ? answer.bytes(one.payload_at, one.payload_bytes) : null,
   };
 }
@@ -204,7 +222,7 @@ function failed(error) {
   return { status: "failed", error, tid: null, timeNs: null, clockErrorNs: null, payload: null };
 }
 
-// --- steps by samples -------------------------------------------------------------------------------
+// --- steps by samples ----------------------------------------------------------------------------
 
 // Moves the shown instant by `count` samples of the first stream shown, or of the view in focus.
 async function step(count) {
@@ -232,7 +250,11 @@ let stepping = false;
 // The time of the sample before or after the one at `t`; null for none.
 async function neighbour(stream, t, direction) {
   const at = async (ns) => {
-    const answer = await connection.request("at", { streams: [stream], t_ns: String(ns), payloads: false });
+    const answer = await connection.request("at", {
+      streams: [stream],
+      t_ns: String(ns),
+      payloads: false,
+    });
     const [sample] = answer.head.samples;
     return sample.status === "ok" ? { tid: sample.tid, ns: BigInt(sample.time_ns) } : null;
   };
@@ -257,7 +279,7 @@ async function neighbour(stream, t, direction) {
   return next?.ns ?? null;
 }
 
-// --- the connection ---------------------------------------------------------------------------------
+// --- the connection ------------------------------------------------------------------------------
 
 let lostAt = null;
 connection.addEventListener("change", () => {
@@ -276,7 +298,9 @@ function showBanner() {
   let text = "";
   if (lostAt) {
     const since = timeOfDay(BigInt(lostAt.getTime()) * 1000000n, 0);
-    text = `No connection to dssm-view at ${location.host} since ${since}. The page tries to reconnect each second.`;
+    text =
+      `No connection to dssm-view at ${location.host} since ${since}. ` +
+      "The page tries to reconnect each second.";
   } else if (overview?.error) {
     text = `dssmd cannot be asked: ${overview.error}. The lists are the last known ones.`;
   }
@@ -284,7 +308,7 @@ function showBanner() {
   setText(banner, text);
 }
 
-// --- the URL's fragment -----------------------------------------------------------------------------
+// --- the URL's fragment --------------------------------------------------------------------------
 
 let urlTimer = null;
 let chosen = { signals: false, views: false }; // whether a person chose them, or a link
@@ -308,8 +332,8 @@ function parsed(text) {
   }
 }
 
-function readUrl() {
-  const state = new URLSearchParams(location.hash.slice(1));
+function readUrl(hash) {
+  const state = new URLSearchParams(hash.slice(1));
   const signalsState = parsed(state.get("signals"));
   if (signalsState) {
     chosen.signals = signals.suggested = true;
@@ -334,11 +358,15 @@ views.addEventListener("change", () => {
   writeUrl();
 });
 for (const event of ["mode", "change"]) {
-  time.addEventListener(event, () => (time.mode === "hold" || event === "mode") && time.hover === null && writeUrl());
+  time.addEventListener(
+    event,
+    () => (time.mode === "hold" || event === "mode") && time.hover === null && writeUrl(),
+  );
 }
-window.addEventListener("hashchange", readUrl);
+// The event's URL: writeUrl() may have changed the present one since.
+window.addEventListener("hashchange", (event) => readUrl(new URL(event.newURL).hash));
 
-// --- dark and light ---------------------------------------------------------------------------------
+// --- dark and light ------------------------------------------------------------------------------
 
 const kThemeKey = "dssm-view-theme";
 const prefersDark = matchMedia("(prefers-color-scheme: dark)");
@@ -372,7 +400,7 @@ function toggleTheme() {
 find("theme").addEventListener("click", toggleTheme);
 prefersDark.addEventListener("change", () => showTheme(storedTheme()));
 
-// --- keys and dialogs -------------------------------------------------------------------------------
+// --- keys and dialogs ----------------------------------------------------------------------------
 
 function toggleKeys() {
   const dialog = find("keys");
@@ -419,5 +447,5 @@ for (const dialog of document.querySelectorAll("dialog")) {
 find("show-keys").addEventListener("click", toggleKeys);
 
 showTheme(storedTheme());
-readUrl();
+readUrl(location.hash);
 overviewPump.wake();

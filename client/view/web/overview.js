@@ -5,7 +5,6 @@ import { element, setText, syncChildren, duration, bytes, rate, timeOfDay, day }
 import { drawGraph } from "./graph.js";
 
 const kUnknown = "\u2013";
-const kDefaultLimitNs = 1500000; // dssmd's, unless the overview has another
 const kMaxEvents = 200;
 
 export class Overview {
@@ -20,7 +19,7 @@ export class Overview {
 
   show(answer) {
     this.answer = answer;
-    const limitNs = answer.clock_limit_ns ?? kDefaultLimitNs;
+    const limitNs = answer.clock_limit_ns ?? null;
     this.showHosts(answer.hosts, limitNs);
     this.showStreams(answer.streams, answer.nodes);
     this.showFindings(answer.findings);
@@ -32,11 +31,12 @@ export class Overview {
     return this.root.querySelector(`#${id}`);
   }
 
-  // --- hosts ----------------------------------------------------------------------------------------
+  // --- hosts -------------------------------------------------------------------------------------
 
   showHosts(hosts, limitNs) {
     setText(this.find("hosts-count"), String(hosts.length));
-    setText(this.find("clock-limit"), `(limit ${duration(limitNs)})`);
+    const limit = limitNs === null ? "" : `(limit ${duration(limitNs)})`;
+    setText(this.find("clock-limit"), limit);
     const key = (host) => host.host ?? host.id ?? host.addresses.join(" ");
     syncChildren(this.find("hosts").tBodies[0], hosts, key, makeHost, (row, host) => {
       const [name, state, trip, streams, bound, address, note] = row.cells;
@@ -54,7 +54,7 @@ export class Overview {
     });
   }
 
-  // --- streams --------------------------------------------------------------------------------------
+  // --- streams -----------------------------------------------------------------------------------
 
   showStreams(streams, nodes) {
     setText(this.find("streams-count"), String(streams.length));
@@ -88,19 +88,40 @@ export class Overview {
     const row = element("tr", { tabindex: "-1" });
     const label = stream.id === 0 ? stream.name : `${stream.name}:${stream.id}`;
     const open = () => this.open(stream.stream);
-    const link = element("button", { class: "link", title: "Show it in a view", onclick: open }, label);
-    row.append(element("th", { scope: "row" }, link, element("span", { class: "at" }, `@${stream.host}`)));
-    const labels = ["State", "Rate", "Age", "Newest tid", "Held", "Lost", "Sample", "Writers", "Readers"];
+    const link = element(
+      "button",
+      { class: "link", title: "Show it in a view", onclick: open },
+      label,
+    );
+    row.append(
+      element("th", { scope: "row" }, link, element("span", { class: "at" }, `@${stream.host}`)),
+    );
+    const labels = [
+      "State",
+      "Rate",
+      "Age",
+      "Newest tid",
+      "Held",
+      "Lost",
+      "Sample",
+      "Writers",
+      "Readers",
+    ];
     for (const [i, text] of labels.entries()) {
       const numeric = i > 0 && i < 7;
       const hint = "What the rings hold: from the oldest to the newest sample";
-      row.append(element("td", { class: numeric ? "number" : i > 6 ? "users" : null, "data-label": text,
-        title: text === "Held" ? hint : null }));
+      row.append(
+        element("td", {
+          class: numeric ? "number" : i > 6 ? "users" : null,
+          "data-label": text,
+          title: text === "Held" ? hint : null,
+        }),
+      );
     }
     return row;
   }
 
-  // --- findings, events -----------------------------------------------------------------------------
+  // --- findings, events --------------------------------------------------------------------------
 
   showFindings(findings) {
     const bad = findings.filter((finding) => finding.status !== "ok");
@@ -120,15 +141,27 @@ export class Overview {
     this.find("no-events").hidden = newest.length > 0;
     const make = (event) => {
       const ns = BigInt(event.time_ns);
-      return element("li", { class: event.severity, "data-severity": event.severity },
-        element("time", { datetime: new Date(Number(ns / 1000000n)).toISOString(), title: day(ns) },
-          timeOfDay(ns)),
-        element("span", {}, event.text));
+      return element(
+        "li",
+        { class: event.severity, "data-severity": event.severity },
+        element(
+          "time",
+          { datetime: new Date(Number(ns / 1000000n)).toISOString(), title: day(ns) },
+          timeOfDay(ns),
+        ),
+        element("span", {}, event.text),
+      );
     };
-    syncChildren(this.find("events"), newest, (event) => String(event.number), make, () => {});
+    syncChildren(
+      this.find("events"),
+      newest,
+      (event) => String(event.number),
+      make,
+      () => {},
+    );
   }
 
-  // --- graph ----------------------------------------------------------------------------------------
+  // --- graph -------------------------------------------------------------------------------------
 
   drawGraph() {
     if (!this.answer || this.root.hidden) return;
@@ -136,12 +169,20 @@ export class Overview {
     const { streams, nodes } = this.answer;
     const inGraph = {
       width: box.clientWidth,
-      streams: streams.map((stream) => [stream.stream, stream.name, stream.id, stream.host, stream.state]),
+      streams: streams.map((stream) => [
+        stream.stream,
+        stream.name,
+        stream.id,
+        stream.host,
+        stream.state,
+      ]),
       nodes: nodes.filter((node) => node.program !== null || node.pid !== null),
     };
     const text = JSON.stringify(inGraph);
     if (text === this.graphText) return;
     this.graphText = text;
+    const isEmpty = streams.length + inGraph.nodes.length === 0;
+    this.root.querySelector("#graph-group").hidden = isEmpty;
     box.replaceChildren(drawGraph(streams, inGraph.nodes, box.clientWidth));
   }
 }
@@ -177,12 +218,16 @@ function setState(cell, text, level) {
 // The bound as a bar: full at the limit.
 function showBound(cell, boundNs, limitNs) {
   if (!cell.firstElementChild) {
-    cell.append(element("span", { class: "bar" }, element("span")), element("span", { class: "value" }));
+    cell.append(
+      element("span", { class: "bar" }, element("span")),
+      element("span", { class: "value" }),
+    );
   }
   const [bar, value] = cell.children;
   const known = boundNs !== null && boundNs !== undefined;
-  const share = known ? Math.min(1, boundNs / limitNs) : 0;
+  const share = known && limitNs !== null ? Math.min(1, boundNs / limitNs) : 0;
   bar.firstElementChild.style.width = `${share * 100}%`;
+  bar.hidden = limitNs === null;
   bar.dataset.level = !known ? "none" : boundNs > limitNs ? "fail" : share > 0.66 ? "warn" : "ok";
   setText(value, known ? duration(boundNs) : "unknown");
 }
@@ -210,9 +255,16 @@ function showUsers(cell, nodes, count) {
   const key = JSON.stringify([names, count]);
   if (cell.dataset.names === key) return;
   cell.dataset.names = key;
-  const parts = names.map(([program, host], i) => element("span", { class: "user" },
-    program, element("span", { class: "at" }, `@${host}${i + 1 < names.length ? "," : ""}`)));
-  if (parts.length === 0) parts.push(count === null ? kUnknown : count === 0 ? "none" : String(count));
+  const parts = names.map(([program, host], i) =>
+    element(
+      "span",
+      { class: "user" },
+      program,
+      element("span", { class: "at" }, `@${host}${i + 1 < names.length ? "," : ""}`),
+    ),
+  );
+  if (parts.length === 0)
+    parts.push(count === null ? kUnknown : count === 0 ? "none" : String(count));
   cell.replaceChildren(...parts);
   cell.classList.toggle("none", names.length === 0);
 }
@@ -227,15 +279,25 @@ function heldText(stream) {
 function lossesOf(stream) {
   const mirror = stream.mirror;
   if (!mirror) return { text: kUnknown, title: "This host has no mirror of it", bad: false };
-  const title = `${mirror.gap_samples} of ${mirror.gap_samples + mirror.received_samples} samples did ` +
+  const title =
+    `${mirror.gap_samples} of ${mirror.gap_samples + mirror.received_samples} samples did ` +
     `not reach this host's mirror; lately ${mirror.recent_lost_samples}`;
   return { text: String(mirror.gap_samples), title, bad: mirror.recent_lost_samples > 0 };
 }
 
 function makeFinding() {
-  return element("li", {}, element("span", { class: "state" }), element("div", {},
-    element("p", {}, element("strong"), " ", element("span")), element("p", { class: "note" }),
-    element("code")));
+  return element(
+    "li",
+    {},
+    element("span", { class: "state" }),
+    element(
+      "div",
+      {},
+      element("p", {}, element("strong"), " ", element("span")),
+      element("p", { class: "note" }),
+      element("code"),
+    ),
+  );
 }
 
 function updateFinding(item, finding) {

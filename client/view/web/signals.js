@@ -1,11 +1,20 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Signals: numeric fields of any streams in panels with one time axis, drawn by uPlot (a global, from
-// its script). The curves of each stream come with one `signals` request; the values at the cursor
+// Signals: numeric fields of any streams in panels with one time axis, drawn by uPlot (a global,
+// from its script). The curves of each stream come with one `signals` request; the values at the cursor
 // come with the page's one `at` request, so that they are those of the exact samples.
 import { Pump, RequestError } from "./connection.js";
 import { findField, guessKind, isFloat, signalsOf, valueOf } from "./fields.js";
-import { cssColor, download, duration, element, number, setText, timeOfDay, wholeDuration } from "./format.js";
+import {
+  cssColor,
+  download,
+  duration,
+  element,
+  number,
+  setText,
+  timeOfDay,
+  wholeDuration,
+} from "./format.js";
 
 const kPeriodMs = 100;
 const kOpeningMs = 100;
@@ -71,11 +80,15 @@ export class Signals extends EventTarget {
     find("export-png").addEventListener("click", () => this.exportPng());
   }
 
-  // --- what is chosen -------------------------------------------------------------------------------
+  // --- what is chosen ----------------------------------------------------------------------------
 
   get state() {
-    return { span: this.span, panels: this.panels.map((panel) => panel.signals.map(
-      (signal) => [signal.stream, signal.field])) };
+    return {
+      span: this.span,
+      panels: this.panels.map((panel) =>
+        panel.signals.map((signal) => [signal.stream, signal.field]),
+      ),
+    };
   }
 
   // As from `state`; anything that does not fit is left out.
@@ -85,7 +98,8 @@ export class Signals extends EventTarget {
     if (!Array.isArray(panels)) return;
     for (const panel of [...this.panels]) this.drop(panel);
     for (const panel of panels.filter(Array.isArray)) {
-      const good = (one) => Array.isArray(one) && one.length === 2 && one.every((x) => typeof x === "string");
+      const good = (one) =>
+        Array.isArray(one) && one.length === 2 && one.every((x) => typeof x === "string");
       this.addPanel(panel.filter(good).map(([stream, field]) => ({ stream, field })));
     }
   }
@@ -97,8 +111,13 @@ export class Signals extends EventTarget {
     const known = [];
     for (const { stream } of this.streams()) {
       const type = await this.types.ask(stream);
-      const names = type ? signalsOf(type).filter((one) => !one.count).slice(0, kFewFields) : [];
-      if (names.length > 0) known.push({ stream, names, isArray: ["scan", "image"].includes(guessKind(type)) });
+      const names = type
+        ? signalsOf(type)
+            .filter((one) => !one.count)
+            .slice(0, kFewFields)
+        : [];
+      if (names.length > 0)
+        known.push({ stream, names, isArray: ["scan", "image"].includes(guessKind(type)) });
     }
     known.sort((a, b) => Number(a.isArray) - Number(b.isArray));
     for (const { stream, names } of known.slice(0, kFewPanels)) {
@@ -122,19 +141,46 @@ export class Signals extends EventTarget {
     this.time.dispatchEvent(new Event("change"));
   }
 
-  // --- panels ---------------------------------------------------------------------------------------
+  // --- panels ------------------------------------------------------------------------------------
 
   addPanel(signals, choose = false) {
     const panel = { signals: [...signals], plot: null };
     panel.legend = element("ul", { class: "legend" });
     panel.plotBox = element("div", { class: "plot" });
     panel.note = element("p", { class: "status", role: "status" });
-    panel.element = element("section", { class: "panel", "aria-label": "Panel" },
-      element("header", {}, panel.legend, element("div", { class: "buttons" },
-        element("button", { class: "choose", onclick: () => this.picker.open(panel) }, "Signals\u2026"),
-        element("button", { class: "quiet", "aria-label": "Remove this panel", title: "Remove this panel",
-          onclick: () => { this.drop(panel); this.changed(); } }, "\u00d7"))),
-      panel.plotBox, panel.note);
+    panel.element = element(
+      "section",
+      { class: "panel", "aria-label": "Panel" },
+      element(
+        "header",
+        {},
+        panel.legend,
+        element(
+          "div",
+          { class: "buttons" },
+          element(
+            "button",
+            { class: "choose", onclick: () => this.picker.open(panel) },
+            "Signals\u2026",
+          ),
+          element(
+            "button",
+            {
+              class: "quiet",
+              "aria-label": "Remove this panel",
+              title: "Remove this panel",
+              onclick: () => {
+                this.drop(panel);
+                this.changed();
+              },
+            },
+            "\u00d7",
+          ),
+        ),
+      ),
+      panel.plotBox,
+      panel.note,
+    );
     this.panels.push(panel);
     this.box.append(panel.element);
     this.rebuild(panel);
@@ -165,16 +211,34 @@ export class Signals extends EventTarget {
   rebuild(panel) {
     panel.plot?.destroy();
     panel.plot = null;
-    panel.legend.replaceChildren(...panel.signals.map((signal, i) => {
-      const [stream, host] = splitHost(signal.stream);
-      return element("li", { "data-signal": nameOf(signal), "data-color": i % kColors },
-        element("span", { class: "swatch" }),
-        element("span", { class: "name" }, `${stream.replace(/:0$/, "")}.${signal.field}`,
-          element("span", { class: "at" }, host)),
-        element("span", { class: "value" }), element("span", { class: "tid", title: "tid" }),
-        element("button", { class: "quiet", "aria-label": `Remove ${nameOf(signal)}`, title: "Remove",
-          onclick: () => this.toggle(panel, signal, false) }, "\u00d7"));
-    }));
+    panel.legend.replaceChildren(
+      ...panel.signals.map((signal, i) => {
+        const [stream, host] = splitHost(signal.stream);
+        return element(
+          "li",
+          { "data-signal": nameOf(signal), "data-color": i % kColors },
+          element("span", { class: "swatch" }),
+          element(
+            "span",
+            { class: "name" },
+            `${stream.replace(/:0$/, "")}.${signal.field}`,
+            element("span", { class: "at" }, host),
+          ),
+          element("span", { class: "value" }),
+          element("span", { class: "tid", title: "tid" }),
+          element(
+            "button",
+            {
+              class: "quiet",
+              "aria-label": `Remove ${nameOf(signal)}`,
+              title: "Remove",
+              onclick: () => this.toggle(panel, signal, false),
+            },
+            "\u00d7",
+          ),
+        );
+      }),
+    );
     panel.plotBox.hidden = panel.signals.length === 0;
     setText(panel.note, panel.signals.length === 0 ? "Choose signals to plot." : "");
     if (panel.signals.length === 0 || this.root.hidden) return;
@@ -190,9 +254,14 @@ export class Signals extends EventTarget {
     const axis = { stroke: text, font, grid, ticks: { ...grid, size: 4 } };
     const stepped = uPlot.paths.stepped({ align: 1 });
     const series = panel.signals.map((signal, i) => {
-      const found = this.types.get(signal.stream) && findField(this.types.get(signal.stream), signal.field);
-      return { stroke: cssColor(`--c${i % kColors}`), width: 1.5, points: { size: 4 },
-        paths: found && !isFloat(found.field) ? stepped : undefined };
+      const found =
+        this.types.get(signal.stream) && findField(this.types.get(signal.stream), signal.field);
+      return {
+        stroke: cssColor(`--c${i % kColors}`),
+        width: 1.5,
+        points: { size: 4 },
+        paths: found && !isFloat(found.field) ? stepped : undefined,
+      };
     });
     const options = {
       ...this.plotSize(),
@@ -200,11 +269,21 @@ export class Signals extends EventTarget {
       legend: { show: false },
       scales: { x: { time: false, range: () => this.windowX() } },
       axes: [
-        { ...axis, size: 26, space: 76, incrs: kIncrements,
-          values: (plot, splits, i, space, step) => splits.map((x) => this.tick(x, step)) },
+        {
+          ...axis,
+          size: 26,
+          space: 76,
+          incrs: kIncrements,
+          values: (plot, splits, i, space, step) => splits.map((x) => this.tick(x, step)),
+        },
         { ...axis, size: 58, values: (plot, splits) => splits.map(number) },
       ],
-      cursor: { x: false, y: false, points: { show: false }, drag: { x: true, y: false, setScale: false } },
+      cursor: {
+        x: false,
+        y: false,
+        points: { show: false },
+        drag: { x: true, y: false, setScale: false },
+      },
       series: [{}, ...series],
       // The place of the cursor is known when the plot has its new scale.
       hooks: { setSelect: [(plot) => this.onSelect(plot)], draw: [() => this.drawCursorIn(panel)] },
@@ -212,8 +291,11 @@ export class Signals extends EventTarget {
     panel.line = null; // the new plot draws at once
     panel.plot = new uPlot(options, [[], ...panel.signals.map(() => [])], panel.plotBox);
     panel.band = element("div", { class: "cursor-band", hidden: true });
-    panel.line = element("div", { class: "cursor-line", hidden: true },
-      element("span", { title: "Bound on the error of the samples' times" }));
+    panel.line = element(
+      "div",
+      { class: "cursor-line", hidden: true },
+      element("span", { title: "Bound on the error of the samples' times" }),
+    );
     panel.plot.over.append(panel.band, panel.line);
     this.listen(panel);
   }
@@ -221,9 +303,12 @@ export class Signals extends EventTarget {
   listen(panel) {
     const { over } = panel.plot;
     let pressedAt = 0;
-    const timeAt = (event) => this.toTime(panel.plot.posToVal(
-      event.clientX - over.getBoundingClientRect().left, "x"));
-    over.addEventListener("mousemove", (event) => this.epoch !== null && this.time.setHover(timeAt(event)));
+    const timeAt = (event) =>
+      this.toTime(panel.plot.posToVal(event.clientX - over.getBoundingClientRect().left, "x"));
+    over.addEventListener(
+      "mousemove",
+      (event) => this.epoch !== null && this.time.setHover(timeAt(event)),
+    );
     over.addEventListener("mouseleave", () => this.time.setHover(null));
     over.addEventListener("mousedown", (event) => (pressedAt = event.clientX));
     over.addEventListener("click", (event) => {
@@ -254,7 +339,7 @@ export class Signals extends EventTarget {
     this.pump.wake();
   }
 
-  // --- the time axis --------------------------------------------------------------------------------
+  // --- the time axis -----------------------------------------------------------------------------
 
   setEpoch(ns) {
     if (this.epoch !== null) return;
@@ -315,15 +400,14 @@ export class Signals extends EventTarget {
     const span = this.zoom ? this.zoom.to - this.zoom.from : this.spanNs();
     const there = this.window && this.window.to - this.window.from === span;
     if (there && t >= this.window.from && t <= this.window.to) return;
-    const { range } = this.time;
-    let from = there && t < this.window.from ? t - span / 10n : t - (span * 9n) / 10n;
-    if (range && !this.zoom && from < range.oldest) from = range.oldest;
-    if (from > t) from = t;
-    this.window = { from, to: from + span };
+    // What was live a moment ago hardly moves; otherwise the instant is near that end.
+    const near = this.window && t > this.window.to && t - this.window.to < span / 10n;
+    const before = there && t < this.window.from ? span / 10n : near ? span : (span * 9n) / 10n;
+    this.window = { from: t - before, to: t - before + span };
     if (this.zoom) this.zoom = this.window;
   }
 
-  // --- requests -------------------------------------------------------------------------------------
+  // --- requests ----------------------------------------------------------------------------------
 
   async ask() {
     if (this.root.hidden) return null;
@@ -352,9 +436,16 @@ export class Signals extends EventTarget {
     const fields = names.filter((name) => findField(type, name));
     if (!live && !this.window) this.keepInWindow();
     if (!live && !this.window) return { status: "ok", curves: new Map() };
-    const span = live ? { span_ns: String(this.spanNs()) }
+    const span = live
+      ? { span_ns: String(this.spanNs()) }
       : { from_ns: String(this.window.from), to_ns: String(this.window.to) };
-    const answer = { status: "ok", error: "", from: this.window?.from ?? null, to: null, curves: new Map() };
+    const answer = {
+      status: "ok",
+      error: "",
+      from: this.window?.from ?? null,
+      to: null,
+      curves: new Map(),
+    };
     this.answers.set(stream, answer);
     if (fields.length === 0) {
       answer.error = `'${stream}' has no field '${names[0]}'`;
@@ -362,10 +453,19 @@ export class Signals extends EventTarget {
     }
     try {
       const binary = await this.connection.request("signals", {
-        stream, fields, ...span, points });
+        stream,
+        fields,
+        ...span,
+        points,
+      });
       const { head } = binary;
-      Object.assign(answer, { status: head.status, error: head.error ?? "", lost: head.lost ?? 0,
-        count: head.samples ?? 0, clockErrorS: head.clock_error_s ?? null });
+      Object.assign(answer, {
+        status: head.status,
+        error: head.error ?? "",
+        lost: head.lost ?? 0,
+        count: head.samples ?? 0,
+        clockErrorS: head.clock_error_s ?? null,
+      });
       if (head.from_ns) answer.from = BigInt(head.from_ns);
       if (head.to_ns) answer.to = BigInt(head.to_ns);
       for (const curve of head.curves ?? []) {
@@ -383,7 +483,7 @@ export class Signals extends EventTarget {
     return answer;
   }
 
-  // --- drawing --------------------------------------------------------------------------------------
+  // --- drawing -----------------------------------------------------------------------------------
 
   draw(panel) {
     if (!panel.plot || !this.window) return;
@@ -394,12 +494,16 @@ export class Signals extends EventTarget {
       if (!curve) return [[], []];
       const start = this.toX(answer.from);
       // uPlot's null is a gap: there samples are missing.
-      return [Array.from(curve.times, (time) => start + time),
-        Array.from(curve.values, (value) => (Number.isNaN(value) ? null : value))];
+      return [
+        Array.from(curve.times, (time) => start + time),
+        Array.from(curve.values, (value) => (Number.isNaN(value) ? null : value)),
+      ];
     });
     panel.plot.setData(uPlot.join(tables));
     setText(panel.note, this.noteOf(panel));
-    panel.element.dataset.points = String(tables.reduce((most, table) => Math.max(most, table[0].length), 0));
+    panel.element.dataset.points = String(
+      tables.reduce((most, table) => Math.max(most, table[0].length), 0),
+    );
   }
 
   noteOf(panel) {
@@ -409,7 +513,8 @@ export class Signals extends EventTarget {
       if (!answer) continue;
       if (answer.status !== "ok") notes.push(`${stream}: ${answer.error || answer.status}`);
       else if (answer.error) notes.push(answer.error);
-      else if ([...answer.curves.values()].every((curve) => curve.times.length === 0)) notes.push(`${stream}: no samples in this window`);
+      else if ([...answer.curves.values()].every((curve) => curve.times.length === 0))
+        notes.push(`${stream}: no samples in this window`);
       if (answer.lost > 0) notes.push(`${stream}: ${answer.lost} samples lost in this window`);
     }
     return notes.join("; ");
@@ -429,7 +534,8 @@ export class Signals extends EventTarget {
         const sample = this.samples.get(signal.stream);
         const type = this.types.get(signal.stream);
         const found = type && findField(type, signal.field);
-        const value = sample?.payload && found ? valueOf(sample.payload, found.field, found.index) : undefined;
+        const value =
+          sample?.payload && found ? valueOf(sample.payload, found.field, found.index) : undefined;
         const text = value === undefined ? (sample?.status ?? "") : number(value);
         setText(item.querySelector(".value"), text);
         item.dataset.value = value === undefined ? "" : String(value);
@@ -466,12 +572,14 @@ export class Signals extends EventTarget {
   }
 
   clockErrorOf(panel) {
-    const errors = panel.signals.map((signal) => this.samples.get(signal.stream)?.clockErrorNs)
-      .filter((error) => error !== null && error !== undefined).map(Number);
+    const errors = panel.signals
+      .map((signal) => this.samples.get(signal.stream)?.clockErrorNs)
+      .filter((error) => error !== null && error !== undefined)
+      .map(Number);
     return errors.length > 0 ? Math.max(...errors) / 1e9 : null;
   }
 
-  // --- export ---------------------------------------------------------------------------------------
+  // --- export ------------------------------------------------------------------------------------
 
   // All samples of the window, each stream's tid and fields in columns of their own.
   async exportCsv() {
@@ -517,8 +625,10 @@ export class Signals extends EventTarget {
     const legendHeight = 22;
     const width = Math.max(...panels.map((panel) => panel.plot.width));
     const heights = panels.map((panel) => panel.plot.height + legendHeight + 8);
-    const canvas = element("canvas", { width: Math.round(width * ratio),
-      height: Math.round(heights.reduce((a, b) => a + b, 8) * ratio) });
+    const canvas = element("canvas", {
+      width: Math.round(width * ratio),
+      height: Math.round(heights.reduce((a, b) => a + b, 8) * ratio),
+    });
     const draw = canvas.getContext("2d");
     draw.scale(ratio, ratio);
     draw.fillStyle = cssColor("--surface");
@@ -529,14 +639,21 @@ export class Signals extends EventTarget {
     for (const [k, panel] of panels.entries()) {
       let left = 12;
       for (const [i, signal] of panel.signals.entries()) {
-        const text = `${nameOf(signal)}  ${panel.legend.children[i].querySelector(".value").textContent}`;
+        const value = panel.legend.children[i].querySelector(".value").textContent;
+        const text = `${nameOf(signal)}  ${value}`;
         draw.fillStyle = cssColor(`--c${i % kColors}`);
         draw.fillRect(left, top + legendHeight / 2 - 2, 12, 4);
         draw.fillStyle = cssColor("--text");
         draw.fillText(text, left + 18, top + legendHeight / 2);
         left += 18 + draw.measureText(text).width + 20;
       }
-      draw.drawImage(panel.plot.ctx.canvas, 0, top + legendHeight, panel.plot.width, panel.plot.height);
+      draw.drawImage(
+        panel.plot.ctx.canvas,
+        0,
+        top + legendHeight,
+        panel.plot.width,
+        panel.plot.height,
+      );
       top += heights[k];
     }
     const blob = await new Promise((resolve) => canvas.toBlob(resolve, "image/png"));
@@ -577,7 +694,9 @@ class Picker {
     this.list.replaceChildren();
     if (!this.dialog.open) this.dialog.showModal();
     this.filter.focus();
-    await Promise.all(this.signals.streams().map((stream) => this.signals.types.ask(stream.stream)));
+    await Promise.all(
+      this.signals.streams().map((stream) => this.signals.types.ask(stream.stream)),
+    );
     this.show();
   }
 
@@ -590,9 +709,22 @@ class Picker {
       if (!type) continue;
       const all = signalsOf(type).filter((one) => fits(`${stream.stream} ${one.name}`));
       if (all.length === 0 && (words.length > 0 || type.fields.length > 0)) continue;
-      groups.push(element("fieldset", {}, element("legend", {}, stream.stream),
-        ...(all.length > 0 ? all.map((one) => this.entry(stream.stream, one))
-          : [element("p", { class: "note" }, "Its type has no description, so its fields are not known.")])));
+      groups.push(
+        element(
+          "fieldset",
+          {},
+          element("legend", {}, stream.stream),
+          ...(all.length > 0
+            ? all.map((one) => this.entry(stream.stream, one))
+            : [
+                element(
+                  "p",
+                  { class: "note" },
+                  "Its type has no description, so its fields are not known.",
+                ),
+              ]),
+        ),
+      );
     }
     if (groups.length === 0) groups.push(element("p", { class: "empty" }, "Nothing fits."));
     this.list.replaceChildren(...groups);
@@ -606,23 +738,47 @@ class Picker {
   checkbox(stream, field) {
     const signal = { stream, field };
     const checked = this.panel.signals.some((other) => nameOf(other) === nameOf(signal));
-    return element("label", {}, element("input", { type: "checkbox", checked,
-      onchange: (event) => this.signals.toggle(this.panel, signal, event.target.checked) }), field);
+    return element(
+      "label",
+      {},
+      element("input", {
+        type: "checkbox",
+        checked,
+        onchange: (event) => this.signals.toggle(this.panel, signal, event.target.checked),
+      }),
+      field,
+    );
   }
 
   // A long array: its elements that are in the panel, and a number for another one.
   arrayEntry(stream, one) {
-    const chosen = this.panel.signals.filter((signal) => signal.stream === stream &&
-      signal.field.startsWith(`${one.name}[`));
-    const index = element("input", { type: "number", min: 0, max: one.count - 1, value: 0,
-      "aria-label": `Element of ${one.name}` });
+    const chosen = this.panel.signals.filter(
+      (signal) => signal.stream === stream && signal.field.startsWith(`${one.name}[`),
+    );
+    const index = element("input", {
+      type: "number",
+      min: 0,
+      max: one.count - 1,
+      value: 0,
+      "aria-label": `Element of ${one.name}`,
+    });
     const add = () => {
       const i = Math.min(one.count - 1, Math.max(0, Math.trunc(Number(index.value))));
       this.signals.toggle(this.panel, { stream, field: `${one.name}[${i}]` }, true);
       this.show();
     };
-    return element("div", {}, ...chosen.map((signal) => this.checkbox(stream, signal.field)),
-      element("div", { class: "array" }, `${one.name}[`, index, "]",
-        element("button", { onclick: add }, "Add")));
+    return element(
+      "div",
+      {},
+      ...chosen.map((signal) => this.checkbox(stream, signal.field)),
+      element(
+        "div",
+        { class: "array" },
+        `${one.name}[`,
+        index,
+        "]",
+        element("button", { onclick: add }, "Add"),
+      ),
+    );
   }
 }

@@ -165,7 +165,8 @@ export class TimeBar {
     this.slider.setAttribute("aria-valuetext", timeOfDay(t));
     const length = duration(end - oldest);
     setText(this.oldest, this.time.recording ? length : `\u2212${length}`);
-    this.oldest.title = this.time.recording ? "The length of the recording"
+    this.oldest.title = this.time.recording
+      ? "The length of the recording"
       : `The rings hold samples from ${timeOfDay(oldest)} to ${timeOfDay(newest)}`;
   }
 }

@@ -49,7 +49,7 @@ export class Views extends EventTarget {
     return [...new Set(this.cards.flatMap((card) => card.chosenStreams()))];
   }
 
-  // The stream whose samples the arrow keys step by: that of the card in focus, or of the first one.
+  // The stream by whose samples the arrow keys step: of the card in focus, or of the first one.
   stepStream() {
     const focused = this.cards.find((card) => card.element.contains(document.activeElement));
     return (focused ?? this.cards[0])?.stream ?? null;
@@ -102,7 +102,10 @@ export class Views extends EventTarget {
     const key = JSON.stringify(names);
     if (key === this.names) return;
     this.names = key;
-    this.adder.replaceChildren(new Option("\u2026", ""), ...names.map((name) => new Option(name, name)));
+    this.adder.replaceChildren(
+      new Option("\u2026", ""),
+      ...names.map((name) => new Option(name, name)),
+    );
     if (!this.root.hidden) this.suggest();
     for (const card of this.cards) card.prepare();
   }
@@ -151,20 +154,27 @@ class Card {
       this.rebuild();
       this.views.changed();
     };
-    this.kindBox = element("select", { "aria-label": `Kind of view of ${this.stream}`, onchange: () => {
-      this.kind = this.kindBox.value || null;
-      changed();
-    } });
-    this.placeBox = element("select", { onchange: () => {
-      this.place = this.placeBox.value || null;
-      changed();
-    } });
+    this.kindBox = element("select", {
+      "aria-label": `Kind of view of ${this.stream}`,
+      onchange: () => {
+        this.kind = this.kindBox.value || null;
+        changed();
+      },
+    });
+    this.placeBox = element("select", {
+      onchange: () => {
+        this.place = this.placeBox.value || null;
+        changed();
+      },
+    });
     this.placeLabel = element("label", { hidden: true }, "placed by ", this.placeBox);
-    this.trailBox = element("select", { onchange: () => {
-      this.trailS = Number(this.trailBox.value);
-      this.trail = null;
-      changed();
-    } });
+    this.trailBox = element("select", {
+      onchange: () => {
+        this.trailS = Number(this.trailBox.value);
+        this.trail = null;
+        changed();
+      },
+    });
     for (const span of kTrailSpans) {
       const text = span === 0 ? "none" : wholeDuration(span);
       this.trailBox.add(new Option(text, span, span === this.trailS, span === this.trailS));
@@ -173,19 +183,40 @@ class Card {
     this.body = element("div", { class: "drawing" });
     this.note = element("p", { class: "status", role: "status" });
     this.foot = {};
-    for (const key of ["tid", "time", "age", "error"]) this.foot[key] = element("span", { class: key });
+    for (const key of ["tid", "time", "age", "error"])
+      this.foot[key] = element("span", { class: key });
     this.foot.error.title = "Bound on the error of the sample's time";
-    this.element = element("article", { class: "card", tabindex: "0", "data-stream": this.stream,
-      "aria-label": this.stream },
-      element("header", {}, element("h3", {}, name.replace(/:0$/, ""),
-        element("span", { class: "at" }, at < 0 ? "" : this.stream.slice(at))),
+    this.element = element(
+      "article",
+      { class: "card", tabindex: "0", "data-stream": this.stream, "aria-label": this.stream },
+      element(
+        "header",
+        {},
+        element(
+          "h3",
+          {},
+          name.replace(/:0$/, ""),
+          element("span", { class: "at" }, at < 0 ? "" : this.stream.slice(at)),
+        ),
         element("div", { class: "options" }, this.placeLabel, this.trailLabel, this.kindBox),
-        element("button", { class: "quiet", title: "Remove this view", "aria-label": `Remove ${this.stream}`,
-          onclick: () => {
-            this.views.remove(this);
-            this.views.changed();
-          } }, "\u00d7")),
-      this.body, this.note, element("footer", {}, ...Object.values(this.foot)));
+        element(
+          "button",
+          {
+            class: "quiet",
+            title: "Remove this view",
+            "aria-label": `Remove ${this.stream}`,
+            onclick: () => {
+              this.views.remove(this);
+              this.views.changed();
+            },
+          },
+          "\u00d7",
+        ),
+      ),
+      this.body,
+      this.note,
+      element("footer", {}, ...Object.values(this.foot)),
+    );
   }
 
   // Asks for the types that it needs, then builds the drawing.
@@ -211,8 +242,12 @@ class Card {
     this.drawing = null;
     if (!this.type) return;
     const guessed = guessKind(this.type);
-    this.kindBox.replaceChildren(new Option(`Auto: ${kKinds[guessed]}`, ""),
-      ...this.possibleKinds().filter((kind) => kind !== guessed).map((kind) => new Option(kKinds[kind], kind)));
+    this.kindBox.replaceChildren(
+      new Option(`Auto: ${kKinds[guessed]}`, ""),
+      ...this.possibleKinds()
+        .filter((kind) => kind !== guessed)
+        .map((kind) => new Option(kKinds[kind], kind)),
+    );
     if (this.kind === guessed) this.kind = null;
     this.kindBox.value = this.kind ?? "";
     const kind = this.shownKind();
@@ -243,12 +278,18 @@ class Card {
   }
 
   showPlaces() {
-    const poses = this.views.streams().map((stream) => stream.stream).filter((stream) => {
-      const type = this.views.types.get(stream);
-      return type && poseOf(type)?.theta;
-    });
+    const poses = this.views
+      .streams()
+      .map((stream) => stream.stream)
+      .filter((stream) => {
+        const type = this.views.types.get(stream);
+        return type && poseOf(type)?.theta;
+      });
     if (this.place && !poses.includes(this.place)) poses.push(this.place);
-    this.placeBox.replaceChildren(new Option("nothing", ""), ...poses.map((name) => new Option(name, name)));
+    this.placeBox.replaceChildren(
+      new Option("nothing", ""),
+      ...poses.map((name) => new Option(name, name)),
+    );
     this.placeBox.value = this.place ?? "";
     this.placeLabel.hidden = this.shownKind() !== "scan" || poses.length === 0;
   }
@@ -263,7 +304,7 @@ class Card {
     return this.place && this.shownKind() === "scan" ? [this.stream, this.place] : [this.stream];
   }
 
-  // --- the sample at the shown instant --------------------------------------------------------------
+  // --- the sample at the shown instant -----------------------------------------------------------
 
   show(t, samples) {
     this.t = t;
@@ -274,8 +315,12 @@ class Card {
     this.showFoot(t, sample);
     if (!sample.payload) return;
     // What a JPEG is, its type need not say.
-    const isJpeg = !this.isJpeg && this.type?.fields.length === 0 && sample.payload.byteLength > 3 &&
-      sample.payload.getUint16(0) === 0xffd8 && sample.payload.getUint8(2) === 0xff;
+    const isJpeg =
+      !this.isJpeg &&
+      this.type?.fields.length === 0 &&
+      sample.payload.byteLength > 3 &&
+      sample.payload.getUint16(0) === 0xffd8 &&
+      sample.payload.getUint8(2) === 0xff;
     if (isJpeg) {
       this.isJpeg = true;
       this.kind ??= "image";
@@ -296,10 +341,18 @@ class Card {
     if (kind === "scan" || kind === "pose") {
       const poseSample = samples.get(this.poseStream());
       const poseType = this.views.types.get(this.poseStream());
-      const pose = poseSample?.payload && poseType ? this.drawing.readPose(poseSample.payload, poseOf(poseType)) : null;
-      const scan = kind === "scan" ? this.drawing.readScan(sample.payload, scanOf(this.type)) : null;
+      const pose =
+        poseSample?.payload && poseType
+          ? this.drawing.readPose(poseSample.payload, poseOf(poseType))
+          : null;
+      const scan =
+        kind === "scan" ? this.drawing.readScan(sample.payload, scanOf(this.type)) : null;
       const missing = kind === "scan" && this.place && !pose;
-      note(missing ? `${this.place}: ${poseSample?.status ?? "no pose"}; the scan is not placed` : scan?.note ?? "");
+      note(
+        missing
+          ? `${this.place}: ${poseSample?.status ?? "no pose"}; the scan is not placed`
+          : (scan?.note ?? ""),
+      );
       this.drawing.show({ scan, pose, trail: pose ? this.trailUntil(pose, poseSample) : null });
     } else {
       note("");
@@ -318,10 +371,13 @@ class Card {
     const age = sample.timeNs === null ? 0n : t - sample.timeNs;
     setText(foot.age, age === 0n ? "" : `${duration(age)} before`);
     foot.age.title = "Before the shown instant";
-    setText(foot.error, sample.clockErrorNs === null ? "" : `\u00b1${duration(sample.clockErrorNs)}`);
+    setText(
+      foot.error,
+      sample.clockErrorNs === null ? "" : `\u00b1${duration(sample.clockErrorNs)}`,
+    );
   }
 
-  // --- the trail ------------------------------------------------------------------------------------
+  // --- the trail ---------------------------------------------------------------------------------
 
   // The trail up to the shown pose.
   trailUntil(pose, sample) {
@@ -341,17 +397,28 @@ class Card {
     if (!pose || this.trailS === 0) return false;
     const { time } = this.views;
     const spanNs = BigInt(this.trailS) * 1000000000n;
-    const span = time.t === null ? { span_ns: String(spanNs) }
-      : { from_ns: String(time.t - spanNs), to_ns: String(time.t + 1n) };
+    const span =
+      time.t === null
+        ? { span_ns: String(spanNs) }
+        : { from_ns: String(time.t - spanNs), to_ns: String(time.t + 1n) };
     try {
-      const answer = await this.views.connection.request("signals", { stream, fields: [pose.x.name, pose.y.name],
-        ...span, points: kTrailPoints });
+      const answer = await this.views.connection.request("signals", {
+        stream,
+        fields: [pose.x.name, pose.y.name],
+        ...span,
+        points: kTrailPoints,
+      });
       if (answer.head.status === "opening") return true;
       const [x, y] = answer.head.curves ?? [];
       if (!x || !y) return false;
       const from = BigInt(answer.head.from_ns ?? span.from_ns);
-      this.trail = joinTrail(from, answer.doubles(x.times_at, x.points), answer.doubles(x.values_at, x.points),
-        answer.doubles(y.times_at, y.points), answer.doubles(y.values_at, y.points));
+      this.trail = joinTrail(
+        from,
+        answer.doubles(x.times_at, x.points),
+        answer.doubles(x.values_at, x.points),
+        answer.doubles(y.times_at, y.points),
+        answer.doubles(y.values_at, y.points),
+      );
       if (this.samples) this.show(this.t, this.samples);
     } catch (error) {
       if (!(error instanceof RequestError)) throw error;
@@ -375,4 +442,3 @@ function joinTrail(from, xTimes, x, yTimes, y) {
   }
   return { from, times: xTimes, x, y: joined };
 }
-

@@ -5,9 +5,9 @@
 #
 #   page.py CHECK URL FOLDER [ARGUMENT...]
 #
-# CHECK is the name of a function below, which says what its arguments are. Screenshots are written to
-# FOLDER. Prints lines for the test that runs it, and "ok" at the end; otherwise what went wrong, with
-# exit status 1. The page must not report an error in the browser's console in any check.
+# CHECK is the name of a function below, which says what its arguments are. Screenshots are written
+# to FOLDER. Prints lines for the test that runs it, and "ok" at the end; otherwise what went wrong,
+# with exit status 1. In no check may the page report an error in the browser's console.
 import json
 import os
 import sys
@@ -65,7 +65,7 @@ class Page:
         self.await_connected()
 
     def await_connected(self):
-        self.wait("the page is connected", lambda: self.get("#connection", "data-state") == "connected")
+        self.wait("connected", lambda: self.get("#connection", "data-state") == "connected")
 
     def all(self, selector):
         return self.driver.find_elements(By.CSS_SELECTOR, selector)
@@ -121,26 +121,27 @@ def card(stream):
     return f"#cards .card[data-stream='{stream}']"
 
 
-# --- checks -----------------------------------------------------------------------------------------
+# --- checks ---------------------------------------------------------------------------------------
 
 
 def overview(page, program, *streams):
     """Hosts and `streams` are shown; `program`, which writes to one of them, as text."""
     page.open("overview")
     for host in ["pc1", "pc2", "pc3"]:
-        page.wait(host, lambda: page.get(f"#hosts tr[data-host='{host}']", "data-state") in ["self", "up"])
+        row = f"#hosts tr[data-host='{host}']"
+        page.wait(host, lambda: page.get(row, "data-state") in ["self", "up"])
     for stream in streams:
         page.wait(stream, lambda: page.one(stream_row(stream)))
     page.wait("the writer", lambda: program in page.one("#streams").text)
     page.wait("the writer's box", lambda: page.all("#graph .program"))
-    titles = page.run("return [...document.querySelectorAll('#graph title')].map(e => e.textContent)")
-    assert any(program in title for title in titles), titles
+    boxes = [box.get_attribute("textContent") for box in page.all("#graph title")]
+    assert any(program in box for box in boxes), boxes
     assert not page.all("#overview img"), "a name was taken for markup"
     assert page.all("#graph path.edge"), "the graph has no arrow"
     assert page.one("#findings-group").text.count("\n") > 0, "no findings of doctor"
     page.shot("overview-light")
-    first_ms = page.run("return performance.getEntriesByName('first-contentful-paint')[0]?.startTime")
-    say("first paint after", first_ms, "ms")
+    paint = "return performance.getEntriesByName('first-contentful-paint')[0]?.startTime"
+    say("first paint after", page.run(paint), "ms")
     page.show_as(DESKTOP, "dark")
     page.wait("dark", lambda: page.run("return document.documentElement.dataset.theme") == "dark")
     page.shot("overview-dark")
@@ -177,7 +178,7 @@ def signal(page, stream, field):
 
 
 def slider(page, *streams):
-    """Prints for places of the slider the shown time [ns] and the shown tid of each of `streams`."""
+    """Prints for places of the slider the shown time [ns], and the shown tid of each stream."""
     page.open("views", views=[{"stream": stream} for stream in streams])
 
     def tids():
@@ -221,7 +222,8 @@ def link(page, stream, *fields):
     assert page.get("#span", "value") == "60"
     page.one(f"[data-signal='{wanted[0]}'] button").click()
     page.wait("one was removed", lambda: names() == wanted[1:])
-    page.wait("it is not in the URL", lambda: urllib.parse.quote(f'"{fields[0]}"') not in page.driver.current_url)
+    removed = urllib.parse.quote(f'"{fields[0]}"')
+    page.wait("it is not in the URL", lambda: removed not in page.driver.current_url)
     page.driver.refresh()
     page.await_connected()
     page.wait("the same after a reload", lambda: names() == wanted[1:])
@@ -240,8 +242,10 @@ def views(page, scan, pose, image, raw):
         page.wait(f"{stream} as {kind}", lambda: page.get(card(stream), "data-kind") == kind)
     pixel = ("const c = arguments[0]; return c.width !== 160 ? null :"
              " [...c.getContext('2d').getImageData(40, 30, 1, 1).data]")
-    page.wait("the image", lambda: page.run(pixel, page.one(card(image) + " canvas")) == [70, 70, 70, 255])
-    drawn = ("const c = arguments[0], d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;"
+    grey = [70, 70, 70, 255]
+    page.wait("the image", lambda: page.run(pixel, page.one(card(image) + " canvas")) == grey)
+    drawn = ("const c = arguments[0];"
+             " const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;"
              " let n = 0; for (let i = 3; i < d.length; i += 4) n += d[i] > 200; return n > 100")
     for stream in [scan, pose]:
         page.wait(f"{stream} is drawn", lambda: page.run(drawn, page.one(card(stream) + " canvas")))
@@ -285,7 +289,8 @@ def phone(page, stream):
     page.show_as(PHONE, "light")
     for tab in ["overview", "signals", "views"]:
         page.open(tab)
-        ready = {"overview": stream_row(stream), "signals": ".legend li", "views": ".card[data-kind]"}
+        ready = {"overview": stream_row(stream), "signals": ".legend li",
+                 "views": ".card[data-kind]"}
         page.wait(f"what {tab} shows", lambda: page.all(ready[tab]))
         page.wait("the graph", lambda: tab != "overview" or page.all("#graph svg"))
         page.shot(f"{tab}-phone")
