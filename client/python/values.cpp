@@ -167,7 +167,7 @@ void define_types(py::module_& module) {
              throw py::value_error("'" + kind + "' is not a kind of a field, such as 'float64'");
            }),
            py::arg("name"), py::arg("kind"), py::arg("offset_bytes"), py::arg("count") = 1,
-           py::arg("stride_bytes") = 0, "A field; kind: 'float64', 'uint8', 'boolean', 'character' ...")
+           py::arg("stride_bytes") = 0, "A field; kind: 'float64', 'uint8', 'bool', 'char' ...")
       .def_readonly("name", &Field::name, "Its name, such as 'pose.x'.")
       .def_property_readonly("kind", [](const Field& field) { return std::string(name_of(field.kind)); },
                              "The type of its elements, such as 'float64'.")

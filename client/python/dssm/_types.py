@@ -16,7 +16,7 @@ from dssm._dssm import Field, TypeInfo
 from dssm._errors import InvalidArgument
 
 _KINDS = {
-    "boolean": "?", "int8": "<i1", "uint8": "<u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4",
+    "bool": "?", "int8": "<i1", "uint8": "<u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4",
     "uint32": "<u4", "int64": "<i8", "uint64": "<u8", "float32": "<f4", "float64": "<f8",
 }
 _BY_DTYPE = {np.dtype(spelled): kind for kind, spelled in _KINDS.items()}
@@ -42,7 +42,7 @@ def dtype_of(info: TypeInfo) -> np.dtype:
 
 def row_dtype(value: np.dtype) -> np.dtype:
     """The dtype of the rows of a history."""
-    return np.dtype((np.record, {
+    return _as_record(np.dtype({
         "names": ["tid", "time_ns", "clock_error_ns", "value"],
         "formats": ["<i8", "<i8", "<i8", value],
         "offsets": [0, 8, 16, 24],
@@ -52,7 +52,7 @@ def row_dtype(value: np.dtype) -> np.dtype:
 
 def _scalars(field: Field) -> np.dtype | None:
     """The dtype of a field that is a scalar or an array; None if numpy has none."""
-    if field.kind == "character":
+    if field.kind == "char":
         adjacent = field.count == 1 or field.stride_bytes == 1
         return np.dtype(f"S{field.count}") if adjacent else None
     scalar = np.dtype(_KINDS[field.kind])
@@ -64,7 +64,7 @@ def _scalars(field: Field) -> np.dtype | None:
 
 
 def _size(field: Field) -> int:
-    return 1 if field.kind == "character" else np.dtype(_KINDS[field.kind]).itemsize
+    return 1 if field.kind == "char" else np.dtype(_KINDS[field.kind]).itemsize
 
 
 def _end(field: Field) -> int:
@@ -74,22 +74,26 @@ def _end(field: Field) -> int:
 def _members(fields: list[tuple[str, Field]], end: int) -> list[tuple[str, int, np.dtype]]:
     """Name, offset and dtype of each member of a struct that ends at `end` in the payload."""
     groups: dict[str, list[tuple[str, Field]]] = {}
+    elements: dict[str, dict[int, list[tuple[str, Field]]]] = {}
     for path, field in fields:
         first, dot, rest = path.partition(".")
-        groups.setdefault(first, []).append((rest if dot else "", field))
+        element = _ELEMENT.fullmatch(first)
+        if element and dot:
+            elements.setdefault(element[1], {}).setdefault(int(element[2]), []).append((rest, field))
+        else:
+            groups.setdefault(first, []).append((rest if dot else "", field))
     members = []
-    elements: dict[str, list[tuple[int, int, np.dtype]]] = {}
+    for name, each in elements.items():
+        array = _array_of_structs(each, groups.get(name, []), end)
+        if array is not None:
+            members.append((name, *array))
+            groups.pop(name, None)
+        else:
+            groups |= {f"{name}[{index}]": inner for index, inner in each.items()}
     for name, inner in groups.items():
         member = _member(inner, end)
-        if member is None:
-            continue
-        element = _ELEMENT.fullmatch(name)
-        if element:
-            elements.setdefault(element[1], []).append((int(element[2]), *member))
-        else:
+        if member is not None:
             members.append((name, *member))
-    for name, parts in elements.items():
-        members += _array_of_structs(name, sorted(parts), groups, end)
     return members
 
 
@@ -115,26 +119,37 @@ def _member(inner: list[tuple[str, Field]], end: int) -> tuple[int, np.dtype] | 
     return start, _record(members, start, max(offset + dtype.itemsize for _, offset, dtype in members) - start)
 
 
-def _array_of_structs(name: str, parts: list[tuple[int, int, np.dtype]],
-                      groups: dict[str, list[tuple[str, Field]]], end: int) -> list[tuple[str, int, np.dtype]]:
-    """A member for elements that are described one by one, or one for each where they differ."""
-    offsets = [offset for _, offset, _ in parts]
-    steps = {after - before for before, after in zip(offsets, offsets[1:])}
-    same = all(dtype == parts[0][2] for _, _, dtype in parts)
-    complete = [index for index, _, _ in parts] == list(range(len(parts)))
-    if len(steps) == 1 and same and complete:
-        stride = steps.pop()
-        start = min(offsets[0], end - len(parts) * stride)
-        if stride >= parts[0][2].itemsize + offsets[0] - start:
-            members = [(member, offsets[0] + offset, dtype)
-                       for member, (dtype, offset, *_) in (parts[0][2].fields or {}).items()]
-            return [(name, start, np.dtype((_record(members, start, stride), (len(parts),))))]
-    return [(f"{name}[{index}]", offset, dtype) for index, offset, dtype in parts]
+def _array_of_structs(elements: dict[int, list[tuple[str, Field]]], common: list[tuple[str, Field]],
+                      end: int) -> tuple[int, np.dtype] | None:
+    """Offset and dtype of an array of structs that contain arrays, which are described one by one.
+
+    `common` are the members that are not arrays, as one field for all elements. None if the elements
+    are not alike.
+    """
+    count = len(elements)
+    if count < 2 or sorted(elements) != list(range(count)):
+        return None
+    first = elements[0]
+    stride = elements[1][0][1].offset_bytes - first[0][1].offset_bytes
+
+    def layout(index: int) -> list[tuple]:
+        return [(path, field.kind, field.count, field.stride_bytes, field.offset_bytes - index * stride)
+                for path, field in elements[index]]
+
+    alike = all(layout(index) == layout(0) for index in range(count))
+    if not alike or any((field.count, field.stride_bytes) != (count, stride) for _, field in common):
+        return None
+    one = first + [(path, Field(field.name, field.kind, field.offset_bytes)) for path, field in common]
+    start = min(min(field.offset_bytes for _, field in one), end - count * stride)
+    if max(_end(field) for _, field in one) > start + stride:
+        return None
+    members = _members(one, start + stride)
+    return start, np.dtype((_record(members, start, stride), (count,)))
 
 
 def _record(members: list[tuple[str, int, np.dtype]], start: int, size: int) -> np.dtype:
     members = sorted(members, key=lambda member: member[1])
-    return np.dtype((np.record, {
+    return _as_record(np.dtype({
         "names": [name for name, _, _ in members],
         "formats": [dtype for _, _, dtype in members],
         "offsets": [offset - start for _, offset, _ in members],
@@ -256,7 +271,7 @@ def _append(fields: list[Field], dtype: np.dtype, path: str, start: int) -> None
 def _scalar_kind(dtype: np.dtype, path: str) -> tuple[str, int]:
     """The kind of a scalar, and how many elements it has."""
     if dtype.kind == "S":
-        return "character", dtype.itemsize
+        return "char", dtype.itemsize
     if dtype.kind == "V":
         return "uint8", dtype.itemsize
     kind = _BY_DTYPE.get(dtype)
