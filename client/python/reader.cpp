@@ -233,10 +233,7 @@ void define_readers(py::module_& module) {
       "Reads a stream. It has a cursor for next() and previous(); reads by time leave it.\n\n"
       "For one thread at a time. Session.reader() makes it.");
   define_reads(type);
-  type.def("next", [](Reader& r, py::handle wait) { return r.reads.next(wait); }, py::kw_only(), py::arg("wait") = false,
-           "The sample after the cursor; the newest one for a new reader. None if there is none yet.\n\n"
-           "wait: True waits for it without a limit, a duration at most so long.")
-      .def("history", &history, py::arg("t0"), py::arg("t1"),
+  type.def("history", &history, py::arg("t0"), py::arg("t1"),
            "The samples with t0 <= time < t1 that the ring still has, as one numpy.recarray with the "
            "fields tid, time_ns, clock_error_ns and value. Keeps the cursor.\n\n"
            "If times run backwards: from the first sample from which on all are at least t0, up to the "

@@ -47,7 +47,7 @@ py::object read_joint(py::handle time, const std::vector<ReaderPtr>& readers, py
   }
   py::list samples;
   for (std::size_t i = 0; i < joints.size(); ++i) {
-    samples.append(Sample{joints[i].info, readers[i]->reads.values().value_of(arrays[i], joints[i].info)});
+    samples.append(make_sample(joints[i].info, readers[i]->reads.values().value_of(arrays[i], joints[i].info)));
   }
   return py::make_tuple(samples, to_ns(result.clock_error));
 }

@@ -10,6 +10,7 @@
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
+#include <array>
 #include <cstring>
 #include <dssm/recording.hpp>
 #include <memory>
@@ -126,8 +127,8 @@ class Reads {
     } while (status == ReadStatus::restarted);
     if (status == ReadStatus::not_yet) return py::none();
     if (status != ReadStatus::ok) raise(status, raw_->id(), "the neighbours of " + text_of(t));
-    return py::make_tuple(Sample{infos.before, values_.value_of(before, infos.before)},
-                          Sample{infos.after, values_.value_of(after, infos.after)});
+    return py::make_tuple(make_sample(infos.before, values_.value_of(before, infos.before)),
+                          make_sample(infos.after, values_.value_of(after, infos.after)));
   }
 
   // --- views of the ring
@@ -162,7 +163,7 @@ class Reads {
     if (status == ReadStatus::not_yet) return py::none();
     if (status != ReadStatus::ok) raise(status, raw_->id(), what());
     is_new_ = false;
-    return py::cast(Sample{info, values_.value_of(array, info)});
+    return make_sample(info, values_.value_of(array, info));
   }
 
   bool wait(MonoTime deadline)
@@ -242,22 +243,120 @@ class Rows {
   std::size_t row_bytes_, size_ = 0;
 };
 
+// --- calls that are made for each sample
+
+// Methods by Python's C interface, whose calls take 0.2 us less than those of pybind11.
+template <class Reader>
+class FastReads {
+ public:
+  static void define(py::class_<Reader, std::shared_ptr<Reader>>& type) {
+    for (PyMethodDef& method : methods) {
+      const auto descriptor = py::reinterpret_steal<py::object>(
+          PyDescr_NewMethod(reinterpret_cast<PyTypeObject*>(type.ptr()), &method));
+      if (!descriptor) throw py::error_already_set();
+      type.attr(method.ml_name) = descriptor;
+    }
+  }
+
+ private:
+  // What pybind11's cast finds, without a search for the type: a method gets only objects of it.
+  static Reader& reader_of(PyObject* self) {
+    const auto* const object = reinterpret_cast<const py::detail::instance*>(self);
+    void* const value = object->simple_layout ? object->simple_value_holder[0] : nullptr;
+    return value ? *static_cast<Reader*>(value) : py::handle(self).cast<Reader&>();
+  }
+
+  // The result of `call`, or a null pointer with its exception set.
+  template <class Call>
+  static PyObject* guarded(Call call) noexcept {
+    try {
+      return call().release().ptr();
+    } catch (py::error_already_set& error) {
+      error.restore();
+    } catch (const py::builtin_exception& error) {
+      error.set_error();
+    } catch (const std::bad_alloc&) {
+      PyErr_NoMemory();
+    } catch (const std::exception& error) {
+      PyErr_SetString(PyExc_RuntimeError, error.what());
+    }
+    return nullptr;
+  }
+
+  // The arguments of a call, by position or by these names; a null pointer where one is missing.
+  template <std::size_t N>
+  static std::array<PyObject*, N> arguments(const char* function, const std::array<const char*, N>& names,
+                                            std::size_t required, PyObject* const* given, Py_ssize_t count,
+                                            PyObject* keywords) {
+    std::array<PyObject*, N> found{};
+    const auto fail = [&](const std::string& text) -> void { throw py::type_error(std::string(function) + "() " + text); };
+    if (count > static_cast<Py_ssize_t>(N)) fail("takes at most " + std::to_string(N) + " arguments");
+    std::copy_n(given, count, found.begin());
+    const Py_ssize_t named = keywords ? PyTuple_GET_SIZE(keywords) : 0;
+    for (Py_ssize_t i = 0; i < named; ++i) {
+      PyObject* const keyword = PyTuple_GET_ITEM(keywords, i);
+      const auto name = std::ranges::find_if(
+          names, [&](const char* each) { return PyUnicode_CompareWithASCIIString(keyword, each) == 0; });
+      if (name == names.end() || found[static_cast<std::size_t>(name - names.begin())]) {
+        fail("has no argument '" + py::handle(keyword).cast<std::string>() + "', or got it twice");
+      }
+      found[static_cast<std::size_t>(name - names.begin())] = given[count + i];
+    }
+    for (std::size_t i = 0; i < required; ++i) {
+      if (!found[i]) fail(std::string("needs '") + names[i] + "'");
+    }
+    return found;
+  }
+
+  static PyObject* newest(PyObject* self, PyObject*) {
+    return guarded([&] { return reader_of(self).reads.newest(); });
+  }
+  static PyObject* tid(PyObject* self, PyObject* tid) {
+    return guarded([&] { return reader_of(self).reads.tid(py::handle(tid).cast<Tid>()); });
+  }
+  static PyObject* at(PyObject* self, PyObject* const* given, Py_ssize_t count, PyObject* keywords) {
+    return guarded([&] {
+      const auto [time, age] = arguments<2>("at", {"time", "max_age"}, 1, given, count, keywords);
+      return reader_of(self).reads.at(time, age ? age : Py_None);
+    });
+  }
+  static PyObject* next(PyObject* self, PyObject* const* given, Py_ssize_t count, PyObject* keywords) {
+    return guarded([&] {
+      const auto [wait] = arguments<1>("next", {"wait"}, 0, given, count, keywords);
+      return reader_of(self).reads.next(wait ? wait : Py_False);
+    });
+  }
+
+  static PyCFunction function(PyObject* (*call)(PyObject*, PyObject* const*, Py_ssize_t, PyObject*)) {
+    return reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(call));
+  }
+
+  static inline PyMethodDef methods[] = {
+      {"newest", &newest, METH_NOARGS, "newest($self)\n--\n\nThe newest sample; None while nothing is written."},
+      {"tid", &tid, METH_O,
+       "tid($self, tid, /)\n--\n\nSample number `tid`; None if it is not written yet. Raises TooOld, Lost, "
+       "Arriving, Restarted."},
+      {"at", function(&at), METH_FASTCALL | METH_KEYWORDS,
+       "at($self, time, max_age=None)\n--\n\n"
+       "The newest sample that is not later than `time`, and at that time not older than `max_age`.\n\n"
+       "None while nothing is written. Raises TooOld (all are later), Stale, ClockOutOfBounds, Arriving. "
+       "Keeps the cursor."},
+      {"next", function(&next), METH_FASTCALL | METH_KEYWORDS,
+       "next($self, wait=False)\n--\n\n"
+       "The sample after the cursor; None if there is none yet. A new reader of a live stream begins with "
+       "the newest one, one of a recording with the first.\n\n"
+       "wait: of a live stream, True waits for it without a limit, a duration at most so long."},
+  };
+};
+
 // Defines what Reads has; `Reader` has a member `reads`.
 template <class Reader>
 void define_reads(py::class_<Reader, std::shared_ptr<Reader>>& type) {
-  type.def("newest", [](Reader& r) { return r.reads.newest(); },
-           "The newest sample; None while nothing is written.")
-      .def("previous", [](Reader& r) { return r.reads.previous(); },
+  FastReads<Reader>::define(type);
+  type.def("previous", [](Reader& r) { return r.reads.previous(); },
            "The sample before the cursor; None if nothing was read before. Raises TooOld.")
-      .def("tid", [](Reader& r, Tid tid) { return r.reads.tid(tid); }, py::arg("tid"),
-           "Sample number `tid`; None if it is not written yet. Raises TooOld, Lost, Arriving, Restarted.")
       .def("info", [](Reader& r, Tid tid) { return r.reads.info(tid); }, py::arg("tid"),
            "The SampleInfo of sample `tid`; keeps the cursor. Raises as tid().")
-      .def("at", [](Reader& r, py::handle time, py::handle max_age) { return r.reads.at(time, max_age); },
-           py::arg("time"), py::arg("max_age") = py::none(),
-           "The newest sample that is not later than `time`, and at that time not older than `max_age`.\n\n"
-           "None while nothing is written. Raises TooOld (all are later), Stale, ClockOutOfBounds, "
-           "Arriving. Keeps the cursor.")
       .def("at_or_after", [](Reader& r, py::handle time) { return r.reads.at_or_after(time); }, py::arg("time"),
            "The first sample from which on all samples have at least that time; None if there is none "
            "yet. Keeps the cursor.")

@@ -78,7 +78,7 @@ struct Cursor {
     const ValueType& values = found->second;
     const py::object array = values.new_array();
     std::ranges::copy(sample.payload, ValueType::bytes_of(array).begin());
-    return py::make_tuple(sample.stream, Sample{sample.info, values.value_of(array, sample.info)});
+    return py::make_tuple(sample.stream, make_sample(sample.info, values.value_of(array, sample.info)));
   }
 
   Recording recording;
@@ -175,10 +175,9 @@ void record_sample(RecordedOutput& output, py::handle value, py::handle time, st
   Duration to_recorder = kUnknownClockError;
   py::object keeper;
   std::span<const std::byte> payload;
-  if (py::isinstance<Sample>(value)) {
-    const auto& sample = value.cast<const Sample&>();
-    info = sample.info;
-    payload = output.values.payload_of(sample.value, keeper);
+  if (is_sample(value)) {
+    info = info_of(value);
+    payload = output.values.payload_of(value_of(value), keeper);
     payload = payload.first(std::min<std::size_t>(payload.size(), info.payload_bytes));
   } else {
     payload = output.values.payload_of(value, keeper);
@@ -242,8 +241,6 @@ void define_reading(py::module_& module) {
       "None is the end. For one thread at a time. Recording.reader() makes it.");
   define_reads(reader);
   reader
-      .def("next", [](RecordedReader& r) { return r.reads.next(py::cast(false)); },
-           "The sample after the cursor, at first the first one; None at the end.")
       .def("history", &recorded_history, py::arg("t0"), py::arg("t1"),
            "The samples with t0 <= time < t1 as one numpy.recarray, as Reader.history().")
       .def("__iter__", [](py::object self) { return self; })

@@ -106,6 +106,19 @@ py::object ValueType::new_rows(std::size_t count) const {
   return make_array(row_dtype_, 1, &shape, nullptr, 0);
 }
 
+bool ValueType::has_shape(PyObject* object) const {
+  auto* const array = reinterpret_cast<PyArrayObject*>(object);
+  const PyArray_ArrayDescr* const wanted = descr_of(dtype_)->subarray;
+  if (!PyArray_EquivTypes(PyArray_DESCR(array), wanted->base)) return false;
+  if (is_bytes_) return PyArray_NDIM(array) == 1 && static_cast<std::size_t>(PyArray_NBYTES(array)) <= payload_bytes_;
+  const auto shape = py::reinterpret_borrow<py::tuple>(wanted->shape);
+  if (static_cast<std::size_t>(PyArray_NDIM(array)) != shape.size()) return false;
+  for (int i = 0; i < PyArray_NDIM(array); ++i) {
+    if (PyArray_DIM(array, i) != shape[static_cast<std::size_t>(i)].cast<npy_intp>()) return false;
+  }
+  return true;
+}
+
 std::span<const std::byte> ValueType::payload_of(py::handle value, py::object& keeper) const {
   const auto is_same = [&](PyArray_Descr* descr) {
     return descr == descr_of(dtype_) || PyArray_EquivTypes(descr, descr_of(dtype_));
@@ -120,9 +133,11 @@ std::span<const std::byte> ValueType::payload_of(py::handle value, py::object& k
   }
   if (PyArray_Check(value.ptr())) {
     keeper = py::reinterpret_borrow<py::object>(value);
-    if (kind_ != Kind::array && PyArray_NDIM(array_of(keeper)) == 0 && is_same(PyArray_DESCR(array_of(keeper)))) {
+    PyArrayObject* const array = array_of(keeper);
+    if (kind_ != Kind::array && PyArray_NDIM(array) == 0 && is_same(PyArray_DESCR(array))) {
       return {data_of(keeper), payload_bytes_};
     }
+    if (kind_ == Kind::array && PyArray_IS_C_CONTIGUOUS(array) && has_shape(keeper.ptr())) return bytes_of(keeper);
   }
   keeper = types("pack")(value, dtype_, is_described_);
   return bytes_of(keeper);
@@ -149,6 +164,16 @@ void check_type(const StreamId& id, const TypeInfo& type, const WantedType& want
 }
 
 namespace {
+
+// --- Sample
+
+struct SampleObject {
+  PyObject_HEAD
+  SampleInfo info;
+  PyObject* value;  // owned
+};
+
+SampleObject& sample_of(PyObject* self) { return *reinterpret_cast<SampleObject*>(self); }
 
 std::string repr_of(const SampleInfo& info) {
   return "tid=" + std::to_string(info.tid) + ", time_ns=" + std::to_string(to_ns(info.time));
@@ -197,7 +222,87 @@ void define_types(py::module_& module) {
       .def("__repr__", [](const TypeInfo& type) { return "<dssm.TypeInfo " + type.description() + ">"; });
 }
 
+PyGetSetDef sample_attributes[] = {
+    {"tid", [](PyObject* self, void*) { return PyLong_FromLongLong(sample_of(self).info.tid); }, nullptr,
+     "Its number in the stream: 0, 1, 2 ...", nullptr},
+    {"time_ns", [](PyObject* self, void*) { return PyLong_FromLongLong(to_ns(sample_of(self).info.time)); },
+     nullptr, "When it was measured, by the writer's clock: ns since 1970.", nullptr},
+    {"time",
+     [](PyObject* self, void*) -> PyObject* {
+       PyArray_DatetimeMetaData metadata{NPY_FR_ns, 1};
+       npy_datetime time = to_ns(sample_of(self).info.time);
+       PyArray_Descr* const descr = PyArray_DescrNewFromType(NPY_DATETIME);
+       if (!descr) return nullptr;
+       reinterpret_cast<PyArray_DatetimeDTypeMetaData*>(descr->c_metadata)->meta = metadata;
+       PyObject* const scalar = PyArray_Scalar(&time, descr, nullptr);
+       Py_DECREF(descr);
+       return scalar;
+     },
+     nullptr, "time_ns as a numpy.datetime64[ns].", nullptr},
+    {"clock_error_ns",
+     [](PyObject* self, void*) { return PyLong_FromLongLong(to_ns(sample_of(self).info.clock_error)); }, nullptr,
+     "Bound on the error of time_ns [ns]; UNKNOWN_CLOCK_ERROR, FOREIGN_CLOCK.", nullptr},
+    {"payload_bytes",
+     [](PyObject* self, void*) { return PyLong_FromUnsignedLongLong(sample_of(self).info.payload_bytes); },
+     nullptr, "The length of its payload; fields beyond it are 0.", nullptr},
+    {"info", [](PyObject* self, void*) { return py::cast(sample_of(self).info).release().ptr(); }, nullptr,
+     "What it has besides its value.", nullptr},
+    {"value",
+     [](PyObject* self, void*) {
+       Py_INCREF(sample_of(self).value);
+       return sample_of(self).value;
+     },
+     nullptr,
+     "A numpy.record with the fields, as value['x'] or value.x; a scalar or an array for a stream of "
+     "such; an array of bytes for one without a description.",
+     nullptr},
+    {},
+};
+
+PyObject* sample_repr(PyObject* self) {
+  return PyUnicode_FromFormat("Sample(%s, value=%S)", repr_of(sample_of(self).info).c_str(), sample_of(self).value);
+}
+
+void sample_dealloc(PyObject* self) {
+  PyTypeObject* const type = Py_TYPE(self);
+  Py_DECREF(sample_of(self).value);
+  PyObject_Free(self);
+  Py_DECREF(type);
+}
+
+char sample_doc[] = "A sample: a copy, with its time.";
+PyType_Slot sample_slots[] = {
+    {Py_tp_doc, sample_doc},
+    {Py_tp_getset, sample_attributes},
+    {Py_tp_repr, reinterpret_cast<void*>(&sample_repr)},
+    {Py_tp_dealloc, reinterpret_cast<void*>(&sample_dealloc)},
+    {},
+};
+PyType_Spec sample_spec = {"dssm.Sample", sizeof(SampleObject), 0,
+                           Py_TPFLAGS_DEFAULT | Py_TPFLAGS_DISALLOW_INSTANTIATION, sample_slots};
+PyTypeObject* sample_type = nullptr;  // of the module, which is never unloaded
+
+void define_sample(py::module_& module) {
+  sample_type = reinterpret_cast<PyTypeObject*>(PyType_FromSpec(&sample_spec));
+  if (!sample_type) throw py::error_already_set();
+  module.add_object("Sample", py::handle(reinterpret_cast<PyObject*>(sample_type)));
+}
+
 }  // namespace
+
+py::object make_sample(const SampleInfo& info, py::object value) {
+  auto* const sample = PyObject_New(SampleObject, sample_type);
+  if (!sample) throw py::error_already_set();
+  sample->info = info;
+  sample->value = value.release().ptr();
+  return py::reinterpret_steal<py::object>(reinterpret_cast<PyObject*>(sample));
+}
+
+bool is_sample(py::handle object) { return Py_IS_TYPE(object.ptr(), sample_type); }
+const SampleInfo& info_of(py::handle sample) { return sample_of(sample.ptr()).info; }
+py::object value_of(py::handle sample) {
+  return py::reinterpret_borrow<py::object>(sample_of(sample.ptr()).value);
+}
 
 void define_values(py::module_& module) {
   if (_import_array() < 0) throw py::error_already_set();
@@ -210,27 +315,7 @@ void define_values(py::module_& module) {
                              "Bound on the error of time_ns [ns]; UNKNOWN_CLOCK_ERROR, FOREIGN_CLOCK.")
       .def_readonly("payload_bytes", &SampleInfo::payload_bytes, "The length of its payload.")
       .def("__repr__", [](const SampleInfo& info) { return "SampleInfo(" + repr_of(info) + ")"; });
-  py::class_<Sample>(module, "Sample", "A sample: a copy, with its time.")
-      .def_property_readonly("tid", [](const Sample& sample) { return sample.info.tid; },
-                             "Its number in the stream: 0, 1, 2 ...")
-      .def_property_readonly("time_ns", [](const Sample& sample) { return to_ns(sample.info.time); },
-                             "When it was measured, by the writer's clock: ns since 1970.")
-      .def_property_readonly("time", [](const Sample& sample) {
-                               return py::module_::import("numpy").attr("datetime64")(to_ns(sample.info.time), "ns");
-                             },
-                             "time_ns as a numpy.datetime64[ns].")
-      .def_property_readonly("clock_error_ns", [](const Sample& sample) { return to_ns(sample.info.clock_error); },
-                             "Bound on the error of time_ns [ns]; UNKNOWN_CLOCK_ERROR, FOREIGN_CLOCK.")
-      .def_property_readonly("payload_bytes", [](const Sample& sample) { return sample.info.payload_bytes; },
-                             "The length of its payload; fields beyond it are 0.")
-      .def_property_readonly("info", [](const Sample& sample) { return sample.info; },
-                             "What it has besides its value.")
-      .def_readonly("value", &Sample::value,
-                    "A numpy.record with the fields, as value['x'] or value.x; a scalar or an array "
-                    "for a stream of such; an array of bytes for one without a description.")
-      .def("__repr__", [](const Sample& sample) {
-        return "Sample(" + repr_of(sample.info) + ", value=" + std::string(py::str(sample.value)) + ")";
-      });
+  define_sample(module);
 }
 
 }  // namespace dssm::python

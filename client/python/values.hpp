@@ -16,11 +16,13 @@
 
 namespace dssm::python {
 
-// A sample as a read returns it: infos and a value that is a copy.
-struct Sample {
-  SampleInfo info;
-  py::object value;
-};
+// A new dssm.Sample: infos and a value that is a copy. Its type is written by Python's C interface,
+// because an object of pybind11 and each use of its attributes take 0.2 us more.
+py::object make_sample(const SampleInfo& info, py::object value);
+bool is_sample(py::handle object);
+// Of a Sample.
+const SampleInfo& info_of(py::handle sample);
+py::object value_of(py::handle sample);
 
 // How the payloads of one stream become values. dssm._types has the conversions between
 // descriptions and dtypes.
@@ -58,6 +60,9 @@ class ValueType {
   std::span<const std::byte> payload_of(py::handle value, py::object& keeper) const;
 
  private:
+  // Whether an array is of the stream's array type, or of bytes that are not too many.
+  bool has_shape(PyObject* array) const;
+
   std::size_t payload_bytes_;
   bool is_described_, is_bytes_;
   py::object dtype_;
