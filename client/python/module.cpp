@@ -24,7 +24,8 @@ std::int64_t as_int64(py::handle value, const char* what) {
 }
 
 [[noreturn]] void raise_type(const std::string& text, py::handle value) {
-  throw py::type_error(text + ", not " + std::string(py::str(py::type::handle_of(value).attr("__name__"))));
+  throw py::type_error(text + ", not " +
+                       std::string(py::str(py::type::handle_of(value).attr("__name__"))));
 }
 
 // A numpy.datetime64 or timedelta64, as ns; numpy raises an error for one that does not fit.
@@ -62,26 +63,31 @@ void Use::raise_in_use() {
 Time to_time(py::handle time) {
   if (PyLong_CheckExact(time.ptr())) return time_from_ns(as_int64(time, "the time"));
   if (PyBool_Check(time.ptr()) || PyFloat_Check(time.ptr())) {
-    raise_type("a time is an int of nanoseconds since 1970, as of time.time_ns(), or a numpy.datetime64",
-               time);
+    raise_type(
+        "a time is an int of nanoseconds since 1970, as of time.time_ns(), or a numpy.datetime64",
+        time);
   }
   if (PyIndex_Check(time.ptr())) {  // numpy's integers
-    return time_from_ns(as_int64(py::reinterpret_steal<py::object>(PyNumber_Index(time.ptr())), "the time"));
+    return time_from_ns(
+        as_int64(py::reinterpret_steal<py::object>(PyNumber_Index(time.ptr())), "the time"));
   }
   if (is_numpy(time, "datetime64")) {
     return time_from_ns(numpy_ns(time, "the time", "datetime64[ns]"));
   }
-  raise_type("a time is an int of nanoseconds since 1970, as of time.time_ns(), or a numpy.datetime64",
-             time);
+  raise_type(
+      "a time is an int of nanoseconds since 1970, as of time.time_ns(), or a numpy.datetime64",
+      time);
 }
 
 Duration to_duration(py::handle duration) {
   double seconds = 0;
-  if (PyFloat_Check(duration.ptr()) || (PyIndex_Check(duration.ptr()) && !PyBool_Check(duration.ptr()))) {
+  if (PyFloat_Check(duration.ptr()) ||
+      (PyIndex_Check(duration.ptr()) && !PyBool_Check(duration.ptr()))) {
     seconds = PyFloat_AsDouble(duration.ptr());
     if (PyErr_Occurred()) throw py::error_already_set();
   } else if (py::isinstance(duration, py::module_::import("datetime").attr("timedelta"))) {
-    const auto microseconds = (duration / py::module_::import("datetime").attr("timedelta")(0, 0, 1));
+    const auto microseconds =
+        (duration / py::module_::import("datetime").attr("timedelta")(0, 0, 1));
     seconds = microseconds.cast<double>() / 1e6;
   } else if (is_numpy(duration, "timedelta64")) {
     seconds = static_cast<double>(numpy_ns(duration, "the duration", "timedelta64[ns]")) / 1e9;
@@ -111,7 +117,8 @@ Duration to_clock_error(py::handle ns) {
   if (PyFloat_Check(ns.ptr()) || PyBool_Check(ns.ptr()) || !PyIndex_Check(ns.ptr())) {
     raise_type("a clock error is an int of nanoseconds", ns);
   }
-  const std::int64_t error = as_int64(py::reinterpret_steal<py::object>(PyNumber_Index(ns.ptr())), "the clock error");
+  const std::int64_t error =
+      as_int64(py::reinterpret_steal<py::object>(PyNumber_Index(ns.ptr())), "the clock error");
   if (error < 0) throw py::value_error("a clock error is at least 0");
   return Duration(error);
 }
@@ -123,21 +130,23 @@ namespace {
 void define_clock(py::module_& module) {
   py::class_<ClockReading>(module, "ClockReading",
                            "The time of this PC's clock, and how far it may be from the reference.")
-      .def_property_readonly("time_ns", [](const ClockReading& of) { return to_ns(of.reading.time); },
-                             "The time: ns since 1970.")
-      .def_property_readonly("clock_error_ns",
-                             [](const ClockReading& of) { return to_ns(of.reading.clock_error); },
-                             "Bound on the distance from the fleet's reference clock [ns]; "
-                             "UNKNOWN_CLOCK_ERROR when nothing is known.")
-      .def_property_readonly("status",
-                             [](const ClockReading& of) { return std::string(name_of(of.reading.status)); },
-                             "'synchronized', 'holdover', 'out of bounds' or 'unknown'.")
+      .def_property_readonly(
+          "time_ns", [](const ClockReading& of) { return to_ns(of.reading.time); },
+          "The time: ns since 1970.")
+      .def_property_readonly(
+          "clock_error_ns", [](const ClockReading& of) { return to_ns(of.reading.clock_error); },
+          "Bound on the distance from the fleet's reference clock [ns]; "
+          "UNKNOWN_CLOCK_ERROR when nothing is known.")
+      .def_property_readonly(
+          "status", [](const ClockReading& of) { return std::string(name_of(of.reading.status)); },
+          "'synchronized', 'holdover', 'out of bounds' or 'unknown'.")
       .def("__repr__", [](const ClockReading& of) {
-        return "ClockReading(time_ns=" + std::to_string(to_ns(of.reading.time)) +
-               ", status='" + std::string(name_of(of.reading.status)) + "')";
+        return "ClockReading(time_ns=" + std::to_string(to_ns(of.reading.time)) + ", status='" +
+               std::string(name_of(of.reading.status)) + "')";
       });
-  module.def("clock_now", [] { return ClockReading{clock::now()}; },
-             "The time now, with its bound. The bound is known while this process has a Session.");
+  module.def(
+      "clock_now", [] { return ClockReading{clock::now()}; },
+      "The time now, with its bound. The bound is known while this process has a Session.");
 }
 
 }  // namespace

@@ -87,7 +87,9 @@ Duration to_clock_error(py::handle ns);
 
 StreamId to_stream_id(std::string_view text);
 
-inline double to_seconds(Duration duration) { return std::chrono::duration<double>(duration).count(); }
+inline double to_seconds(Duration duration) {
+  return std::chrono::duration<double>(duration).count();
+}
 
 // --- objects that are used by one thread at a time
 

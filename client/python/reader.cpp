@@ -2,14 +2,12 @@
 //
 // Readers of live streams: waiting, history, and samples in place (borrow()).
 //
-// A view of the ring is an array whose base is a capsule with a Lease, which keeps the reader and so
-// the mapping. The C++ reader unmaps a ring when it restarts for the second time after; reads that
-// could do so are refused while such an array exists (Reads::check_leases()).
+// A view of the ring is an array whose base is a capsule with a Lease, which keeps the reader and
+// so the mapping. The C++ reader unmaps a ring when the stream restarts for the second time after
+// borrow(); reads that could do so are refused while such an array exists (Reads::check_leases()).
 #include "client/python/reader.hpp"
 
 #include <pybind11/stl.h>
-
-
 
 namespace dssm::python {
 namespace {
@@ -49,7 +47,8 @@ class Borrowed {
     if (info().payload_bytes < payload_bytes_) {
       if (values_.is_bytes()) return payload();
       raise("too_short", "sample " + std::to_string(info().tid) + " of '" + name_ + "' has " +
-                             std::to_string(info().payload_bytes) + " of " + std::to_string(payload_bytes_) +
+                             std::to_string(info().payload_bytes) + " of " +
+                             std::to_string(payload_bytes_) +
                              " bytes: use payload, or a read that copies");
     }
     if (!value_) value_ = values_.view(sample().payload(), lease_);
@@ -58,22 +57,26 @@ class Borrowed {
   py::object payload() const { return ValueType::bytes_view(sample().payload(), lease_); }
   bool still_valid() const { return sample().still_valid(); }
 
-  // Ends the loan. Raises Overwritten, also in place of an exception that torn data may have caused.
+  // Ends the loan. Raises Overwritten, also in place of an exception that torn data may have
+  // caused.
   void exit(py::handle exception) {
     const bool is_valid = still_valid();
     const Tid tid = info().tid;
     lease_ = py::object();
     value_ = py::object();
-    const bool replaces = exception.is_none() || py::isinstance(exception, py::handle(PyExc_Exception));
+    const bool replaces =
+        exception.is_none() || py::isinstance(exception, py::handle(PyExc_Exception));
     if (is_valid || !replaces) return;
-    raise("overwritten", "sample " + std::to_string(tid) + " of '" + name_ +
-                             "' was overwritten while it was borrowed: what was computed with it is void. "
-                             "Copy it, or give the stream more history");
+    raise("overwritten",
+          "sample " + std::to_string(tid) + " of '" + name_ +
+              "' was overwritten while it was borrowed: what was computed with it is void. "
+              "Copy it, or give the stream more history");
   }
 
  private:
   const BorrowedSample& sample() const {
-    if (!lease_) raise("closed", "the sample is no longer borrowed: use it inside of the with block");
+    if (!lease_)
+      raise("closed", "the sample is no longer borrowed: use it inside of the with block");
     return sample_;
   }
   std::string name_;
@@ -198,8 +201,9 @@ void raise(ReadStatus status, const StreamId& id, const std::string& what) {
       reason = "the stream has a new ring, whose tids begin at 0 again";
       break;
     case ReadStatus::clock_out_of_bounds:
-      reason = "the clocks of this PC and of the stream's host may differ by more than dssmd's key "
-               "clock_limit allows; `dssmctl hosts` shows them";
+      reason =
+          "the clocks of this PC and of the stream's host may differ by more than dssmd's key "
+          "clock_limit allows; `dssmctl hosts` shows them";
       break;
     case ReadStatus::arriving:
       reason = "it is on its way from the stream's host: read it again a little later";
@@ -215,18 +219,23 @@ void raise(ReadStatus status, const StreamId& id, const std::string& what) {
 }
 
 void define_readers(py::module_& module) {
-  py::class_<Borrowed>(module, "Borrowed", "A sample in its slot, without a copy; for a `with` block.")
-      .def_property_readonly("value", &Borrowed::value,
-                             "Its value, read-only, in the memory of the ring. A writer may overwrite "
-                             "it at any moment: then the end of the block raises Overwritten.")
+  py::class_<Borrowed>(module, "Borrowed",
+                       "A sample in its slot, without a copy; for a `with` block.")
+      .def_property_readonly(
+          "value", &Borrowed::value,
+          "Its value, read-only, in the memory of the ring. A writer may overwrite "
+          "it at any moment: then the end of the block raises Overwritten.")
       .def_property_readonly("payload", &Borrowed::payload, "Its bytes, as a read-only array.")
       .def_property_readonly("info", &Borrowed::info, "Its SampleInfo.")
-      .def_property_readonly("tid", [](const Borrowed& b) { return b.info().tid; }, "Its tid.")
-      .def_property_readonly("time_ns", [](const Borrowed& b) { return to_ns(b.info().time); },
-                             "When it was measured: ns since 1970.")
+      .def_property_readonly(
+          "tid", [](const Borrowed& b) { return b.info().tid; }, "Its tid.")
+      .def_property_readonly(
+          "time_ns", [](const Borrowed& b) { return to_ns(b.info().time); },
+          "When it was measured: ns since 1970.")
       .def("still_valid", &Borrowed::still_valid, "Whether it was not overwritten until now.")
       .def("__enter__", [](py::object self) { return self; })
-      .def("__exit__", [](Borrowed& b, py::handle, py::handle exception, py::handle) { b.exit(exception); });
+      .def("__exit__",
+           [](Borrowed& b, py::handle, py::handle exception, py::handle) { b.exit(exception); });
 
   py::class_<Reader, std::shared_ptr<Reader>> type(
       module, "Reader",
@@ -234,39 +243,49 @@ void define_readers(py::module_& module) {
       "For one thread at a time. Session.reader() makes it.");
   define_reads(type);
   type.def("history", &history, py::arg("t0"), py::arg("t1"),
-           "The samples with t0 <= time < t1 that the ring still has, as one numpy.recarray with the "
+           "The samples with t0 <= time < t1 that the ring still has, as one numpy.recarray with "
+           "the "
            "fields tid, time_ns, clock_error_ns and value. Keeps the cursor.\n\n"
-           "If times run backwards: from the first sample from which on all are at least t0, up to the "
+           "If times run backwards: from the first sample from which on all are at least t0, up to "
+           "the "
            "first one that is at least t1.")
       .def("borrow", &borrow, py::arg("tid") = py::none(),
            "Sample `tid`, or the newest one, without a copy: `with reader.borrow() as sample:`.\n\n"
            "The end of the block raises Overwritten if a writer has overwritten it. Raises NotYet, "
            "TooOld, Lost, Arriving, Restarted.")
-      .def("wait", [](Reader& r, py::handle timeout) { return r.reads.wait(to_deadline(timeout)); },
-           py::arg("timeout") = py::none(),
-           "Waits until there is a sample after the cursor; whether there is one.")
-      .def("wait_for_tid",
-           [](Reader& r, Tid tid, py::handle timeout) {
-             RawReader& raw = r.reads.raw();
-             const MonoTime deadline = to_deadline(timeout);
-             const Use use(r.reads.in_use());
-             return wait_in_slices(deadline, [&](MonoTime end) { return raw.wait_for_tid(tid, end); });
-           },
-           py::arg("tid"), py::arg("timeout") = py::none(),
-           "Waits until newest_tid is at least `tid`; whether it is.")
+      .def(
+          "wait", [](Reader& r, py::handle timeout) { return r.reads.wait(to_deadline(timeout)); },
+          py::arg("timeout") = py::none(),
+          "Waits until there is a sample after the cursor; whether there is one.")
+      .def(
+          "wait_for_tid",
+          [](Reader& r, Tid tid, py::handle timeout) {
+            RawReader& raw = r.reads.raw();
+            const MonoTime deadline = to_deadline(timeout);
+            const Use use(r.reads.in_use());
+            return wait_in_slices(deadline,
+                                  [&](MonoTime end) { return raw.wait_for_tid(tid, end); });
+          },
+          py::arg("tid"), py::arg("timeout") = py::none(),
+          "Waits until newest_tid is at least `tid`; whether it is.")
       .def("fileno", &fileno,
-           "A descriptor for select and asyncio: readable when there may be samples newer than at the "
+           "A descriptor for select and asyncio: readable when there may be samples newer than at "
+           "the "
            "last clear_ready(). The reader owns it.")
-      .def("clear_ready", [](Reader& r) { r.reads.raw().clear_ready(); },
-           "After the descriptor was readable, before next() until that returns None.")
-      .def("in_bounds", [](Reader& r, const SampleInfo& info) { return r.reads.raw().clock_in_bounds(info); },
-           py::arg("info"), "Whether reads by time accept the sample: see ClockOutOfBounds.")
-      .def_property_readonly("restart_error",
-                             [](const Reader& r) -> std::optional<std::string> {
-                               const auto error = r.reads.raw().restart_error();
-                               return error ? std::optional(error->message) : std::nullopt;
-                             },
-                             "Why it cannot continue with the stream's new ring; None if it can.")
+      .def(
+          "clear_ready", [](Reader& r) { r.reads.raw().clear_ready(); },
+          "After the descriptor was readable, before next() until that returns None.")
+      .def(
+          "in_bounds",
+          [](Reader& r, const SampleInfo& info) { return r.reads.raw().clock_in_bounds(info); },
+          py::arg("info"), "Whether reads by time accept the sample: see ClockOutOfBounds.")
+      .def_property_readonly(
+          "restart_error",
+          [](const Reader& r) -> std::optional<std::string> {
+            const auto error = r.reads.raw().restart_error();
+            return error ? std::optional(error->message) : std::nullopt;
+          },
+          "Why it cannot continue with the stream's new ring; None if it can.")
       .def("__iter__", [](py::object self) { return self; })
       .def("__next__", [](Reader& r) {
         for (;;) {

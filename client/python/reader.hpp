@@ -43,11 +43,13 @@ py::object read_joint(py::handle time, const std::vector<ReaderPtr>& readers, py
   } while (result.status == ReadStatus::restarted);
   if (result.status == ReadStatus::not_yet) return py::none();
   if (result.status != ReadStatus::ok) {
-    raise(result.status, readers[result.index]->reads.raw().id(), "time " + std::to_string(to_ns(t)) + " ns");
+    raise(result.status, readers[result.index]->reads.raw().id(),
+          "time " + std::to_string(to_ns(t)) + " ns");
   }
   py::list samples;
   for (std::size_t i = 0; i < joints.size(); ++i) {
-    samples.append(make_sample(joints[i].info, readers[i]->reads.values().value_of(arrays[i], joints[i].info)));
+    samples.append(make_sample(joints[i].info,
+                               readers[i]->reads.values().value_of(arrays[i], joints[i].info)));
   }
   return py::make_tuple(samples, to_ns(result.clock_error));
 }

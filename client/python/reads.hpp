@@ -34,7 +34,8 @@ class Reads {
 
   Reads(Raw raw, const WantedType& wanted)
       : raw_(std::make_shared<Raw>(std::move(raw))),
-        values_(wanted.dtype.is_none() ? ValueType(raw_->type()) : ValueType(raw_->type(), wanted.dtype)) {
+        values_(wanted.dtype.is_none() ? ValueType(raw_->type())
+                                       : ValueType(raw_->type(), wanted.dtype)) {
     check_type(raw_->id(), raw_->type(), wanted);
   }
 
@@ -66,7 +67,8 @@ class Reads {
     }
     return read(
         [this](Raw& raw, auto payload, auto& info) {
-          return is_new_ && !kMayWait ? raw.read_newest(payload, info) : raw.read_next(payload, info);
+          return is_new_ && !kMayWait ? raw.read_newest(payload, info)
+                                      : raw.read_next(payload, info);
         },
         [] { return std::string("the next sample"); });
   }
@@ -77,8 +79,9 @@ class Reads {
   }
 
   py::object tid(Tid tid) {
-    return read([&](Raw& raw, auto payload, auto& info) { return raw.read_tid(tid, payload, info); },
-                [&] { return "sample " + std::to_string(tid); }, false);
+    return read(
+        [&](Raw& raw, auto payload, auto& info) { return raw.read_tid(tid, payload, info); },
+        [&] { return "sample " + std::to_string(tid); }, false);
   }
 
   py::object info(Tid tid) {
@@ -97,20 +100,25 @@ class Reads {
   py::object at(py::handle time, py::handle max_age) {
     const Time t = to_time(time);
     const Duration age = to_duration(max_age, kAnyAge);
-    return read_by_time([&](Raw& raw, auto payload, auto& info) { return raw.read_at(t, payload, info, age); }, t);
+    return read_by_time(
+        [&](Raw& raw, auto payload, auto& info) { return raw.read_at(t, payload, info, age); }, t);
   }
   py::object at_or_after(py::handle time) {
     const Time t = to_time(time);
-    return read_by_time([&](Raw& raw, auto payload, auto& info) { return raw.read_at_or_after(t, payload, info); }, t);
+    return read_by_time(
+        [&](Raw& raw, auto payload, auto& info) { return raw.read_at_or_after(t, payload, info); },
+        t);
   }
   py::object nearest(py::handle time) {
     const Time t = to_time(time);
-    return read_by_time([&](Raw& raw, auto payload, auto& info) { return raw.read_nearest(t, payload, info); }, t);
+    return read_by_time(
+        [&](Raw& raw, auto payload, auto& info) { return raw.read_nearest(t, payload, info); }, t);
   }
   py::object find(py::handle time) {
     const Time t = to_time(time);
     SampleInfo info;
-    return checked(raw_read([&](Raw& raw) { return raw.find(t, info); }), info, [&] { return text_of(t); });
+    return checked(raw_read([&](Raw& raw) { return raw.find(t, info); }), info,
+                   [&] { return text_of(t); });
   }
 
   py::object neighbours(py::handle time) {
@@ -121,7 +129,8 @@ class Reads {
     ReadStatus status;
     do {
       status = raw_read([&](Raw& raw) {
-        return raw.read_neighbours(t, ValueType::bytes_of(before), ValueType::bytes_of(after), infos);
+        return raw.read_neighbours(t, ValueType::bytes_of(before), ValueType::bytes_of(after),
+                                   infos);
       });
       check_leases();
     } while (status == ReadStatus::restarted);
@@ -141,9 +150,10 @@ class Reads {
   // Raises an exception if a read could unmap memory that a view shows.
   void check_leases() const {
     if (leases_.empty() || *leases_.begin() >= raw().restarts()) return;
-    raise("in_use", "read '" + raw().id().str() +
-                        "': an array of a borrowed sample still shows a ring that the stream has not had "
-                        "since a restart; delete it, or copy it while it is borrowed");
+    raise("in_use",
+          "read '" + raw().id().str() +
+              "': an array of a borrowed sample still shows a ring that the stream has not had "
+              "since a restart; delete it, or copy it while it is borrowed");
   }
 
   // A read that may set the cursor or continue with another ring; `what` names it for errors.
@@ -166,9 +176,7 @@ class Reads {
     return make_sample(info, values_.value_of(array, info));
   }
 
-  bool wait(MonoTime deadline)
-  requires(!kMayWait)
-  {
+  bool wait(MonoTime deadline) requires(!kMayWait) {
     Raw& raw = this->raw();
     const Use use(in_use_);
     return wait_in_slices(deadline, [&](MonoTime end) { return raw.wait(end); });
@@ -218,11 +226,14 @@ class Reads {
 class Rows {
  public:
   Rows(const ValueType& values, std::size_t capacity)
-      : array_(values.new_rows(capacity)), data_(ValueType::data_of(array_)), row_bytes_(values.row_bytes()) {}
+      : array_(values.new_rows(capacity)),
+        data_(ValueType::data_of(array_)),
+        row_bytes_(values.row_bytes()) {}
 
   // Where the payload of the next row goes; then add() completes the row.
   std::span<std::byte> payload() const noexcept {
-    return {data_ + size_ * row_bytes_ + ValueType::kRowHeaderBytes, row_bytes_ - ValueType::kRowHeaderBytes};
+    return {data_ + size_ * row_bytes_ + ValueType::kRowHeaderBytes,
+            row_bytes_ - ValueType::kRowHeaderBytes};
   }
   void add(const SampleInfo& info) noexcept {
     zero_rest(payload(), info);
@@ -285,18 +296,23 @@ class FastReads {
 
   // The arguments of a call, by position or by these names; a null pointer where one is missing.
   template <std::size_t N>
-  static std::array<PyObject*, N> arguments(const char* function, const std::array<const char*, N>& names,
-                                            std::size_t required, PyObject* const* given, Py_ssize_t count,
-                                            PyObject* keywords) {
+  static std::array<PyObject*, N> arguments(const char* function,
+                                            const std::array<const char*, N>& names,
+                                            std::size_t required, PyObject* const* given,
+                                            Py_ssize_t count, PyObject* keywords) {
     std::array<PyObject*, N> found{};
-    const auto fail = [&](const std::string& text) -> void { throw py::type_error(std::string(function) + "() " + text); };
-    if (count > static_cast<Py_ssize_t>(N)) fail("takes at most " + std::to_string(N) + " arguments");
+    const auto fail = [&](const std::string& text) -> void {
+      throw py::type_error(std::string(function) + "() " + text);
+    };
+    if (count > static_cast<Py_ssize_t>(N))
+      fail("takes at most " + std::to_string(N) + " arguments");
     std::copy_n(given, count, found.begin());
     const Py_ssize_t named = keywords ? PyTuple_GET_SIZE(keywords) : 0;
     for (Py_ssize_t i = 0; i < named; ++i) {
       PyObject* const keyword = PyTuple_GET_ITEM(keywords, i);
-      const auto name = std::ranges::find_if(
-          names, [&](const char* each) { return PyUnicode_CompareWithASCIIString(keyword, each) == 0; });
+      const auto name = std::ranges::find_if(names, [&](const char* each) {
+        return PyUnicode_CompareWithASCIIString(keyword, each) == 0;
+      });
       if (name == names.end() || found[static_cast<std::size_t>(name - names.begin())]) {
         fail("has no argument '" + py::handle(keyword).cast<std::string>() + "', or got it twice");
       }
@@ -314,36 +330,44 @@ class FastReads {
   static PyObject* tid(PyObject* self, PyObject* tid) {
     return guarded([&] { return reader_of(self).reads.tid(py::handle(tid).cast<Tid>()); });
   }
-  static PyObject* at(PyObject* self, PyObject* const* given, Py_ssize_t count, PyObject* keywords) {
+  static PyObject* at(PyObject* self, PyObject* const* given, Py_ssize_t count,
+                      PyObject* keywords) {
     return guarded([&] {
       const auto [time, age] = arguments<2>("at", {"time", "max_age"}, 1, given, count, keywords);
       return reader_of(self).reads.at(time, age ? age : Py_None);
     });
   }
-  static PyObject* next(PyObject* self, PyObject* const* given, Py_ssize_t count, PyObject* keywords) {
+  static PyObject* next(PyObject* self, PyObject* const* given, Py_ssize_t count,
+                        PyObject* keywords) {
     return guarded([&] {
       const auto [wait] = arguments<1>("next", {"wait"}, 0, given, count, keywords);
       return reader_of(self).reads.next(wait ? wait : Py_False);
     });
   }
 
-  static PyCFunction function(PyObject* (*call)(PyObject*, PyObject* const*, Py_ssize_t, PyObject*)) {
+  static PyCFunction function(PyObject* (*call)(PyObject*, PyObject* const*, Py_ssize_t,
+                                                PyObject*)) {
     return reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(call));
   }
 
   static inline PyMethodDef methods[] = {
-      {"newest", &newest, METH_NOARGS, "newest($self)\n--\n\nThe newest sample; None while nothing is written."},
+      {"newest", &newest, METH_NOARGS,
+       "newest($self)\n--\n\nThe newest sample; None while nothing is written."},
       {"tid", &tid, METH_O,
-       "tid($self, tid, /)\n--\n\nSample number `tid`; None if it is not written yet. Raises TooOld, Lost, "
+       "tid($self, tid, /)\n--\n\nSample number `tid`; None if it is not written yet. Raises "
+       "TooOld, Lost, "
        "Arriving, Restarted."},
       {"at", function(&at), METH_FASTCALL | METH_KEYWORDS,
        "at($self, time, max_age=None)\n--\n\n"
-       "The newest sample that is not later than `time`, and at that time not older than `max_age`.\n\n"
-       "None while nothing is written. Raises TooOld (all are later), Stale, ClockOutOfBounds, Arriving. "
+       "The newest sample that is not later than `time`, and at that time not older than "
+       "`max_age`.\n\n"
+       "None while nothing is written. Raises TooOld (all are later), Stale, ClockOutOfBounds, "
+       "Arriving. "
        "Keeps the cursor."},
       {"next", function(&next), METH_FASTCALL | METH_KEYWORDS,
        "next($self, wait=False)\n--\n\n"
-       "The sample after the cursor; None if there is none yet. A new reader of a live stream begins with "
+       "The sample after the cursor; None if there is none yet. A new reader of a live stream "
+       "begins with "
        "the newest one, one of a recording with the first.\n\n"
        "wait: of a live stream, True waits for it without a limit, a duration at most so long."},
   };
@@ -353,65 +377,91 @@ class FastReads {
 template <class Reader>
 void define_reads(py::class_<Reader, std::shared_ptr<Reader>>& type) {
   FastReads<Reader>::define(type);
-  type.def("previous", [](Reader& r) { return r.reads.previous(); },
-           "The sample before the cursor; None if nothing was read before. Raises TooOld.")
-      .def("info", [](Reader& r, Tid tid) { return r.reads.info(tid); }, py::arg("tid"),
-           "The SampleInfo of sample `tid`; keeps the cursor. Raises as tid().")
-      .def("at_or_after", [](Reader& r, py::handle time) { return r.reads.at_or_after(time); }, py::arg("time"),
-           "The first sample from which on all samples have at least that time; None if there is none "
-           "yet. Keeps the cursor.")
-      .def("nearest", [](Reader& r, py::handle time) { return r.reads.nearest(time); }, py::arg("time"),
-           "The sample that is closest to `time`; None while nothing is written. Keeps the cursor.")
-      .def("neighbours", [](Reader& r, py::handle time) { return r.reads.neighbours(time); }, py::arg("time"),
-           "The samples before and after `time`, for interpolation; None if there is none after it "
-           "yet. Raises TooOld. Keeps the cursor.")
-      .def("find", [](Reader& r, py::handle time) { return r.reads.find(time); }, py::arg("time"),
-           "The SampleInfo of the sample that at(time) returns.")
-      .def("seek", [](Reader& r, Tid tid) { r.reads.seek(tid); }, py::arg("tid"),
-           "Sets the cursor: next() returns the sample after `tid`; NO_TID: from the oldest one on.")
-      .def("clock_error_ns",
-           [](Reader& r, const SampleInfo& info) { return to_ns(r.reads.raw().clock_error(info)); },
-           py::arg("info"),
-           "Bound on the distance of a sample's time from the reading PC's clock [ns]; "
-           "UNKNOWN_CLOCK_ERROR.")
-      .def("close", [](Reader& r) { r.reads.close(); }, "Closes it; other calls then raise Closed.")
+  type.def(
+          "previous", [](Reader& r) { return r.reads.previous(); },
+          "The sample before the cursor; None if nothing was read before. Raises TooOld.")
+      .def(
+          "info", [](Reader& r, Tid tid) { return r.reads.info(tid); }, py::arg("tid"),
+          "The SampleInfo of sample `tid`; keeps the cursor. Raises as tid().")
+      .def(
+          "at_or_after", [](Reader& r, py::handle time) { return r.reads.at_or_after(time); },
+          py::arg("time"),
+          "The first sample from which on all samples have at least that time; None if there is "
+          "none "
+          "yet. Keeps the cursor.")
+      .def(
+          "nearest", [](Reader& r, py::handle time) { return r.reads.nearest(time); },
+          py::arg("time"),
+          "The sample that is closest to `time`; None while nothing is written. Keeps the cursor.")
+      .def(
+          "neighbours", [](Reader& r, py::handle time) { return r.reads.neighbours(time); },
+          py::arg("time"),
+          "The samples before and after `time`, for interpolation; None if there is none after it "
+          "yet. Raises TooOld. Keeps the cursor.")
+      .def(
+          "find", [](Reader& r, py::handle time) { return r.reads.find(time); }, py::arg("time"),
+          "The SampleInfo of the sample that at(time) returns.")
+      .def(
+          "seek", [](Reader& r, Tid tid) { r.reads.seek(tid); }, py::arg("tid"),
+          "Sets the cursor: next() returns the sample after `tid`; NO_TID: from the oldest one on.")
+      .def(
+          "clock_error_ns",
+          [](Reader& r, const SampleInfo& info) { return to_ns(r.reads.raw().clock_error(info)); },
+          py::arg("info"),
+          "Bound on the distance of a sample's time from the reading PC's clock [ns]; "
+          "UNKNOWN_CLOCK_ERROR.")
+      .def(
+          "close", [](Reader& r) { r.reads.close(); }, "Closes it; other calls then raise Closed.")
       .def("__enter__", [](py::object self) { return self; })
       .def("__exit__", [](Reader& r, const py::args&) { r.reads.close(); })
-      .def_property_readonly("closed", [](const Reader& r) { return r.reads.is_closed(); }, "Whether it is closed.")
-      .def_property_readonly("cursor", [](const Reader& r) { return r.reads.raw().cursor(); },
-                             "The tid of the last sample read by tid or in order; NO_TID.")
-      .def_property_readonly("newest_tid", [](const Reader& r) { return r.reads.raw().newest_tid(); },
-                             "The tid of the newest sample; NO_TID while nothing is written.")
-      .def_property_readonly("oldest_tid", [](const Reader& r) { return r.reads.raw().oldest_tid(); },
-                             "The tid of the oldest sample that can be read; NO_TID.")
-      .def_property_readonly("lost_samples", [](const Reader& r) { return r.reads.raw().lost_samples(); },
-                             "Samples that next() skipped because they were no longer there.")
-      .def_property_readonly("restarts", [](const Reader& r) { return r.reads.raw().restarts(); },
-                             "How often the stream got a new ring, whose tids begin at 0 again.")
-      .def_property_readonly("name", [](const Reader& r) { return r.reads.raw().id().str(); },
-                             "The stream: 'lidar:0@pc1'.")
-      .def_property_readonly("type", [](const Reader& r) { return r.reads.raw().type(); },
-                             "The stream's description.")
-      .def_property_readonly("dtype", [](const Reader& r) { return r.reads.values().dtype(); },
-                             "The numpy.dtype of values.")
-      .def_property_readonly("payload_bytes", [](const Reader& r) { return r.reads.raw().payload_bytes(); },
-                             "Of a sample, at most.")
-      .def_property_readonly("depth", [](const Reader& r) { return r.reads.raw().depth(); },
-                             "The slots of the ring, which holds one sample less.")
-      .def_property_readonly("cycle", [](const Reader& r) { return to_seconds(r.reads.raw().cycle()); },
-                             "The expected time between two samples [s].")
-      .def("property", [](const Reader& r) -> py::object {
-             Use::check(r.reads.in_use());
-             const auto& raw = r.reads.raw();
-             Result<std::vector<std::byte>> property = [&] {
-               const Use use(r.reads.in_use());
-               return without_gil([&] { return raw.property(); });
-             }();
-             if (!property && property.error().code == Errc::not_found) return py::none();
-             const std::vector<std::byte> bytes = python::value_of(std::move(property));
-             return py::bytes(reinterpret_cast<const char*>(bytes.data()), bytes.size());
-           },
-           "The stream's property as bytes; None if it has none.");
+      .def_property_readonly(
+          "closed", [](const Reader& r) { return r.reads.is_closed(); }, "Whether it is closed.")
+      .def_property_readonly(
+          "cursor", [](const Reader& r) { return r.reads.raw().cursor(); },
+          "The tid of the last sample read by tid or in order; NO_TID.")
+      .def_property_readonly(
+          "newest_tid", [](const Reader& r) { return r.reads.raw().newest_tid(); },
+          "The tid of the newest sample; NO_TID while nothing is written.")
+      .def_property_readonly(
+          "oldest_tid", [](const Reader& r) { return r.reads.raw().oldest_tid(); },
+          "The tid of the oldest sample that can be read; NO_TID.")
+      .def_property_readonly(
+          "lost_samples", [](const Reader& r) { return r.reads.raw().lost_samples(); },
+          "Samples that next() skipped because they were no longer there.")
+      .def_property_readonly(
+          "restarts", [](const Reader& r) { return r.reads.raw().restarts(); },
+          "How often the stream got a new ring, whose tids begin at 0 again.")
+      .def_property_readonly(
+          "name", [](const Reader& r) { return r.reads.raw().id().str(); },
+          "The stream: 'lidar:0@pc1'.")
+      .def_property_readonly(
+          "type", [](const Reader& r) { return r.reads.raw().type(); }, "The stream's description.")
+      .def_property_readonly(
+          "dtype", [](const Reader& r) { return r.reads.values().dtype(); },
+          "The numpy.dtype of values.")
+      .def_property_readonly(
+          "payload_bytes", [](const Reader& r) { return r.reads.raw().payload_bytes(); },
+          "Of a sample, at most.")
+      .def_property_readonly(
+          "depth", [](const Reader& r) { return r.reads.raw().depth(); },
+          "The slots of the ring, which holds one sample less.")
+      .def_property_readonly(
+          "cycle", [](const Reader& r) { return to_seconds(r.reads.raw().cycle()); },
+          "The expected time between two samples [s].")
+      .def(
+          "property",
+          [](const Reader& r) -> py::object {
+            Use::check(r.reads.in_use());
+            const auto& raw = r.reads.raw();
+            Result<std::vector<std::byte>> property = [&] {
+              const Use use(r.reads.in_use());
+              return without_gil([&] { return raw.property(); });
+            }();
+            if (!property && property.error().code == Errc::not_found) return py::none();
+            const std::vector<std::byte> bytes = python::value_of(std::move(property));
+            return py::bytes(reinterpret_cast<const char*>(bytes.data()), bytes.size());
+          },
+          "The stream's property as bytes; None if it has none.");
 }
 
 }  // namespace dssm::python

@@ -4,13 +4,12 @@
 //
 // No function of Python is called from a thread of the session: it would wait for the GIL, which a
 // thread that destroys the session may hold.
-#include <dssm/session.hpp>
-
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
 #include <condition_variable>
 #include <cstdio>
+#include <dssm/session.hpp>
 #include <memory>
 #include <mutex>
 #include <optional>
@@ -64,7 +63,8 @@ void notify(const Connection& connection, const std::string& text) {
 }
 
 // Session::await_raw_reader() does the same, but signals do not interrupt it.
-RawReader await_reader(Connection& connection, const StreamId& id, MonoTime deadline, FetchHistory history) {
+RawReader await_reader(Connection& connection, const StreamId& id, MonoTime deadline,
+                       FetchHistory history) {
   Session session = connection.get();
   std::mutex mutex;
   std::condition_variable changed;
@@ -77,7 +77,8 @@ RawReader await_reader(Connection& connection, const StreamId& id, MonoTime dead
   };
   const MonoTime notice_at = deadline_in(2s);
   std::optional<Errc> reported;
-  auto watch = std::make_unique<Session::Watch>(value_without_gil([&] { return session.watch(on_event); }));
+  auto watch =
+      std::make_unique<Session::Watch>(value_without_gil([&] { return session.watch(on_event); }));
   // Its end waits for a running callback.
   const auto end_watch = [](Session::Watch* ended) {
     const py::gil_scoped_release released;
@@ -111,17 +112,20 @@ std::shared_ptr<Reader> open_reader(Connection& connection, std::string_view nam
   if (wait.is(py::handle(Py_False))) {
     Session session = connection.get();
     return std::make_shared<Reader>(
-        value_without_gil([&] { return session.open_raw_reader(id, nullptr, 0, history); }), wanted);
+        value_without_gil([&] { return session.open_raw_reader(id, nullptr, 0, history); }),
+        wanted);
   }
-  return std::make_shared<Reader>(await_reader(connection, id, wait_deadline(wait), history), wanted);
+  return std::make_shared<Reader>(await_reader(connection, id, wait_deadline(wait), history),
+                                  wanted);
 }
 
-std::unique_ptr<Writer> create_stream(Connection& connection, std::string_view name, py::handle type,
-                               py::handle cycle, py::handle life, std::optional<std::uint64_t> depth,
-                               bool keep_existing) {
+std::unique_ptr<Writer> create_stream(Connection& connection, std::string_view name,
+                                      py::handle type, py::handle cycle, py::handle life,
+                                      std::optional<std::uint64_t> depth, bool keep_existing) {
   const StreamId id = to_stream_id(name);
   const WantedType wanted = wanted_type(type);
-  if (!wanted.type) throw py::type_error("create() needs the type of the stream's samples, not None");
+  if (!wanted.type)
+    throw py::type_error("create() needs the type of the stream's samples, not None");
   if (life.is_none() == !depth.has_value()) {
     throw py::type_error("create() needs how much history the stream keeps: either life or depth");
   }
@@ -135,14 +139,15 @@ std::unique_ptr<Writer> create_stream(Connection& connection, std::string_view n
                                   wanted);
 }
 
-std::unique_ptr<Writer> open_writer(Connection& connection, std::string_view name, py::handle type) {
+std::unique_ptr<Writer> open_writer(Connection& connection, std::string_view name,
+                                    py::handle type) {
   const StreamId id = to_stream_id(name);
   const WantedType wanted = wanted_type(type);
   Session session = connection.get();
-  return std::make_unique<Writer>(value_without_gil([&] {
-                                    return session.open_raw_writer(id, wanted.type ? &*wanted.type : nullptr);
-                                  }),
-                                  wanted);
+  return std::make_unique<Writer>(
+      value_without_gil(
+          [&] { return session.open_raw_writer(id, wanted.type ? &*wanted.type : nullptr); }),
+      wanted);
 }
 
 py::object stream_property(Connection& connection, std::string_view name) {
@@ -159,7 +164,8 @@ void set_stream_property(Connection& connection, std::string_view name, std::str
   const StreamId id = to_stream_id(name);
   Session session = connection.get();
   value_without_gil([&] {
-    return session.set_property(id, std::as_bytes(std::span<const char>(property.data(), property.size())));
+    return session.set_property(
+        id, std::as_bytes(std::span<const char>(property.data(), property.size())));
   });
 }
 
@@ -174,46 +180,59 @@ void define_session_infos(py::module_& module) {
       .def_readonly("pid", &StreamUser::pid, "Its process id; 0: not known.")
       .def_readonly("program", &StreamUser::program, "Its name.")
       .def_readonly("host", &StreamUser::host, "Where it runs.")
-      .def_property_readonly("role", [](const StreamUser& u) { return u.role == Role::writer ? "writer" : "reader"; },
-                             "'reader' or 'writer'.")
-      .def_property_readonly("via", [](const StreamUser& u) { return std::string(name_of(u.via)); },
-                             "How: 'local', 'mirror', 'remote writer', 'connection'.");
+      .def_property_readonly(
+          "role", [](const StreamUser& u) { return u.role == Role::writer ? "writer" : "reader"; },
+          "'reader' or 'writer'.")
+      .def_property_readonly(
+          "via", [](const StreamUser& u) { return std::string(name_of(u.via)); },
+          "How: 'local', 'mirror', 'remote writer', 'connection'.");
   py::class_<StreamInfo>(module, "StreamInfo", "The present state of a stream.")
-      .def_property_readonly("name", [](const StreamInfo& s) { return s.id.str(); }, "'lidar:0@pc1'.")
-      .def_property_readonly("host", [](const StreamInfo& s) { return s.id.host; }, "The host that owns it.")
+      .def_property_readonly(
+          "name", [](const StreamInfo& s) { return s.id.str(); }, "'lidar:0@pc1'.")
+      .def_property_readonly(
+          "host", [](const StreamInfo& s) { return s.id.host; }, "The host that owns it.")
       .def_readonly("type", &StreamInfo::type, "Its description.")
       .def_readonly("depth", &StreamInfo::depth, "The slots of its ring.")
-      .def_property_readonly("cycle", [](const StreamInfo& s) { return to_seconds(s.cycle); },
-                             "The expected time between two samples [s].")
+      .def_property_readonly(
+          "cycle", [](const StreamInfo& s) { return to_seconds(s.cycle); },
+          "The expected time between two samples [s].")
       .def_readonly("memory_bytes", &StreamInfo::memory_bytes, "Of the ring.")
       .def_readonly("property_bytes", &StreamInfo::property_bytes, "Of its property; 0: none.")
       .def_readonly("oldest_tid", &StreamInfo::oldest, "The tid of the oldest sample; NO_TID.")
       .def_readonly("newest_tid", &StreamInfo::newest, "The tid of the newest sample; NO_TID.")
-      .def_property_readonly("newest_time_ns",
-                             [](const StreamInfo& s) {
-                               return s.newest == kNoTid ? std::nullopt : std::optional(to_ns(s.newest_time));
-                             },
-                             "The time of the newest sample; None while nothing is written.")
+      .def_property_readonly(
+          "newest_time_ns",
+          [](const StreamInfo& s) {
+            return s.newest == kNoTid ? std::nullopt : std::optional(to_ns(s.newest_time));
+          },
+          "The time of the newest sample; None while nothing is written.")
       .def_readonly("rate_hz", &StreamInfo::rate_hz, "Samples a second; 0: not known.")
-      .def_property_readonly("state", [](const StreamInfo& s) { return std::string(name_of(s.state)); },
-                             "'live', 'stalled', 'no writer', 'empty' or 'unknown'.")
-      .def_readonly("writers", &StreamInfo::writers, "How many times it is open for writing, on all hosts.")
-      .def_readonly("readers", &StreamInfo::readers, "How many times it is open for reading, on all hosts.")
+      .def_property_readonly(
+          "state", [](const StreamInfo& s) { return std::string(name_of(s.state)); },
+          "'live', 'stalled', 'no writer', 'empty' or 'unknown'.")
+      .def_readonly("writers", &StreamInfo::writers,
+                    "How many times it is open for writing, on all hosts.")
+      .def_readonly("readers", &StreamInfo::readers,
+                    "How many times it is open for reading, on all hosts.")
       .def_readonly("users", &StreamInfo::users, "The processes; from Session.stream() only.")
       .def("__repr__", [](const StreamInfo& s) { return "<dssm.StreamInfo " + s.id.str() + ">"; });
   py::class_<HostInfo>(module, "HostInfo", "A host as this PC's dssmd sees it.")
       .def_readonly("name", &HostInfo::name, "Empty until it has answered.")
       .def_readonly("addresses", &HostInfo::addresses, "As configured and as reached.")
       .def_readonly("version", &HostInfo::version, "Of its dssmd.")
-      .def_property_readonly("state", [](const HostInfo& h) { return std::string(name_of(h.state)); },
-                             "Such as 'up' or 'down'.")
+      .def_property_readonly(
+          "state", [](const HostInfo& h) { return std::string(name_of(h.state)); },
+          "Such as 'up' or 'down'.")
       .def_readonly("error", &HostInfo::error, "Why it is not up; empty: it is.")
-      .def_property_readonly("round_trip", [](const HostInfo& h) { return to_seconds(h.round_trip); },
-                             "Of the last heartbeat [s]; 0: none yet.")
+      .def_property_readonly(
+          "round_trip", [](const HostInfo& h) { return to_seconds(h.round_trip); },
+          "Of the last heartbeat [s]; 0: none yet.")
       .def_readonly("streams", &HostInfo::streams, "How many it owns.")
-      .def_property_readonly("clock_distance_ns", [](const HostInfo& h) { return optional_ns(h.clock_distance); },
-                             "Greatest distance of its clock from this PC's [ns]; None: not known.")
-      .def_readonly("clock_reason", &HostInfo::clock_reason, "Why its times are not good here; empty: they are.")
+      .def_property_readonly(
+          "clock_distance_ns", [](const HostInfo& h) { return optional_ns(h.clock_distance); },
+          "Greatest distance of its clock from this PC's [ns]; None: not known.")
+      .def_readonly("clock_reason", &HostInfo::clock_reason,
+                    "Why its times are not good here; empty: they are.")
       .def("__repr__", [](const HostInfo& h) {
         return "<dssm.HostInfo " + h.name + " " + std::string(name_of(h.state)) + ">";
       });
@@ -227,28 +246,34 @@ void define_session_infos(py::module_& module) {
 }
 
 void define_playback_clock(py::module_& module) {
-  py::class_<PlaybackClock>(module, "PlaybackClock",
-                            "The PC's playback clock: real time, or what a player of recordings sets. "
-                            "Times are float seconds since 1970.")
+  py::class_<PlaybackClock>(
+      module, "PlaybackClock",
+      "The PC's playback clock: real time, or what a player of recordings sets. "
+      "Times are float seconds since 1970.")
       .def("now", &PlaybackClock::now_s, "The time of the clock [s].")
-      .def("sleep_until",
-           [](const PlaybackClock& clock, double time_s) {
-             // A signal ends the wait, so that its handler in Python runs.
-             while (without_gil([&] { return clock.sleep_until(time_s); }) != WaitStatus::ready) {
-               if (PyErr_CheckSignals() != 0) throw py::error_already_set();
-             }
-           },
-           py::arg("time"), "Waits until now() has reached `time` [s].")
-      .def("reset", &PlaybackClock::reset, "Shows the real time.", py::call_guard<py::gil_scoped_release>())
+      .def(
+          "sleep_until",
+          [](const PlaybackClock& clock, double time_s) {
+            // A signal ends the wait, so that its handler in Python runs.
+            while (without_gil([&] { return clock.sleep_until(time_s); }) != WaitStatus::ready) {
+              if (PyErr_CheckSignals() != 0) throw py::error_already_set();
+            }
+          },
+          py::arg("time"), "Waits until now() has reached `time` [s].")
+      .def("reset", &PlaybackClock::reset, "Shows the real time.",
+           py::call_guard<py::gil_scoped_release>())
       .def("set_time", &PlaybackClock::set_time, py::arg("time"), "Sets now() to `time` [s].",
            py::call_guard<py::gil_scoped_release>())
       .def("set_speed", &PlaybackClock::set_speed, py::arg("speed"),
-           "1: real time; 0: stands still; negative: backwards.", py::call_guard<py::gil_scoped_release>())
+           "1: real time; 0: stands still; negative: backwards.",
+           py::call_guard<py::gil_scoped_release>())
       .def("set_paused", &PlaybackClock::set_paused, py::arg("paused"), "Stops it, or continues.",
            py::call_guard<py::gil_scoped_release>())
-      .def_property_readonly("speed", [](const PlaybackClock& clock) { return clock.setting().speed; }, "Its speed.")
-      .def_property_readonly("paused", [](const PlaybackClock& clock) { return clock.setting().paused; },
-                             "Whether it is stopped.");
+      .def_property_readonly(
+          "speed", [](const PlaybackClock& clock) { return clock.setting().speed; }, "Its speed.")
+      .def_property_readonly(
+          "paused", [](const PlaybackClock& clock) { return clock.setting().paused; },
+          "Whether it is stopped.");
 }
 
 }  // namespace
@@ -265,69 +290,83 @@ void define_sessions(py::module_& module) {
            "socket_path: '' is $DSSM_SOCKET, else /run/dssm/dssmd.sock.\n"
            "program: shown by dssmctl; '' is the name of the script.\n"
            "request_timeout: how long calls wait for dssmd.\n"
-           "on_notice: called with a text when reader(wait=...) waits for longer than 2 s; None prints it.")
+           "on_notice: called with a text when reader(wait=...) waits for longer than 2 s; None "
+           "prints it.")
       .def("reader", &open_reader, py::arg("name"), py::arg("type") = py::none(), py::kw_only(),
            py::arg("wait") = false, py::arg("fetch_history") = false,
            "Opens a stream for reading.\n\n"
-           "type: None takes the stream's own; else a numpy.dtype, what numpy makes one of, a dataclass "
+           "type: None takes the stream's own; else a numpy.dtype, what numpy makes one of, a "
+           "dataclass "
            "or a TypeInfo, and raises TypeMismatch if the stream has another one.\n"
-           "wait: False raises NotFound at once; True waits for the stream, a duration at most so long.\n"
+           "wait: False raises NotFound at once; True waits for the stream, a duration at most so "
+           "long.\n"
            "fetch_history: of another host's stream, have its history here when this returns.")
-      .def("create", &create_stream, py::arg("name"), py::arg("type"), py::kw_only(), py::arg("cycle"),
-           py::arg("life") = py::none(), py::arg("depth") = py::none(), py::arg("keep_existing") = false,
+      .def("create", &create_stream, py::arg("name"), py::arg("type"), py::kw_only(),
+           py::arg("cycle"), py::arg("life") = py::none(), py::arg("depth") = py::none(),
+           py::arg("keep_existing") = false,
            "Creates a stream, if there is none of that type, and opens it for writing.\n\n"
            "type: as in reader().\n"
            "cycle: the expected time between two samples.\n"
-           "life: how long samples are kept, at one each cycle; or depth: slots for samples, one more than "
+           "life: how long samples are kept, at one each cycle; or depth: slots for samples, one "
+           "more than "
            "are kept.\n"
            "keep_existing: keeps an existing stream also if it has less history.")
       .def("writer", &open_writer, py::arg("name"), py::arg("type") = py::none(),
            "Opens an existing stream for writing; type: as in reader().")
-      .def("remove",
-           [](Connection& c, std::string_view name) {
-             const StreamId id = to_stream_id(name);
-             Session session = c.get();
-             value_without_gil([&] { return session.remove(id); });
-           },
-           py::arg("name"), "Removes a stream. What has it open keeps its samples.")
-      .def("streams",
-           [](Connection& c) {
-             Session session = c.get();
-             return value_without_gil([&] { return session.list_streams(); });
-           },
-           "All streams, of all hosts.")
-      .def("stream",
-           [](Connection& c, std::string_view name) {
-             const StreamId id = to_stream_id(name);
-             Session session = c.get();
-             return value_without_gil([&] { return session.stream_info(id); });
-           },
-           py::arg("name"), "One stream, with its users. Raises NotFound.")
-      .def("hosts",
-           [](Connection& c) {
-             Session session = c.get();
-             return value_without_gil([&] { return session.list_hosts(); });
-           },
-           "This PC, and all other hosts.")
-      .def("property", &stream_property, py::arg("name"), "A stream's property as bytes; None if it has none.")
+      .def(
+          "remove",
+          [](Connection& c, std::string_view name) {
+            const StreamId id = to_stream_id(name);
+            Session session = c.get();
+            value_without_gil([&] { return session.remove(id); });
+          },
+          py::arg("name"), "Removes a stream. What has it open keeps its samples.")
+      .def(
+          "streams",
+          [](Connection& c) {
+            Session session = c.get();
+            return value_without_gil([&] { return session.list_streams(); });
+          },
+          "All streams, of all hosts.")
+      .def(
+          "stream",
+          [](Connection& c, std::string_view name) {
+            const StreamId id = to_stream_id(name);
+            Session session = c.get();
+            return value_without_gil([&] { return session.stream_info(id); });
+          },
+          py::arg("name"), "One stream, with its users. Raises NotFound.")
+      .def(
+          "hosts",
+          [](Connection& c) {
+            Session session = c.get();
+            return value_without_gil([&] { return session.list_hosts(); });
+          },
+          "This PC, and all other hosts.")
+      .def("property", &stream_property, py::arg("name"),
+           "A stream's property as bytes; None if it has none.")
       .def("set_property", &set_stream_property, py::arg("name"), py::arg("property"),
            "Replaces a stream's property; b'' removes it.")
-      .def("playback_clock",
-           [](Connection& c) {
-             Session session = c.get();
-             return value_without_gil([&] { return session.open_playback_clock(); });
-           },
-           "The PC's playback clock.")
-      .def("daemon",
-           [](Connection& c) {
-             Session session = c.get();
-             return value_without_gil([&] { return session.daemon_info(); });
-           },
-           "This PC's dssmd.")
-      .def_property_readonly("is_connected", [](Connection& c) { return c.get().is_connected(); },
-                             "Whether it is connected now; it reconnects by itself.")
-      .def("close", [](Connection& c) { c.session.reset(); },
-           "Closes the connection. Readers and writers remain usable.")
+      .def(
+          "playback_clock",
+          [](Connection& c) {
+            Session session = c.get();
+            return value_without_gil([&] { return session.open_playback_clock(); });
+          },
+          "The PC's playback clock.")
+      .def(
+          "daemon",
+          [](Connection& c) {
+            Session session = c.get();
+            return value_without_gil([&] { return session.daemon_info(); });
+          },
+          "This PC's dssmd.")
+      .def_property_readonly(
+          "is_connected", [](Connection& c) { return c.get().is_connected(); },
+          "Whether it is connected now; it reconnects by itself.")
+      .def(
+          "close", [](Connection& c) { c.session.reset(); },
+          "Closes the connection. Readers and writers remain usable.")
       .def("__enter__", [](py::object self) { return self; })
       .def("__exit__", [](Connection& c, const py::args&) { c.session.reset(); });
 }

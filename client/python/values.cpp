@@ -14,9 +14,7 @@
 namespace dssm::python {
 namespace {
 
-py::object types(const char* function) {
-  return py::module_::import("dssm._types").attr(function);
-}
+py::object types(const char* function) { return py::module_::import("dssm._types").attr(function); }
 
 PyArrayObject* array_of(const py::object& object) {
   return reinterpret_cast<PyArrayObject*>(object.ptr());
@@ -26,10 +24,11 @@ PyArray_Descr* descr_of(const py::object& dtype) {
 }
 
 // A new array of `dtype`, with dimensions of its own or of a dtype that is an array.
-py::object make_array(const py::object& dtype, int dimensions, npy_intp* shape, void* data, int flags) {
+py::object make_array(const py::object& dtype, int dimensions, npy_intp* shape, void* data,
+                      int flags) {
   Py_INCREF(dtype.ptr());  // which this function takes over
-  PyObject* const array =
-      PyArray_NewFromDescr(&PyArray_Type, descr_of(dtype), dimensions, shape, nullptr, data, flags, nullptr);
+  PyObject* const array = PyArray_NewFromDescr(&PyArray_Type, descr_of(dtype), dimensions, shape,
+                                               nullptr, data, flags, nullptr);
   if (!array) throw py::error_already_set();
   return py::reinterpret_steal<py::object>(array);
 }
@@ -58,7 +57,8 @@ ValueType::ValueType(const TypeInfo& type, py::object dtype)
   kind_ = PyDataType_HASSUBARRAY(descr) ? Kind::array
           : PyDataType_HASFIELDS(descr) ? Kind::record
                                         : Kind::scalar;
-  is_bytes_ = !is_described_ && kind_ == Kind::array && descr->subarray->base->type_num == NPY_UINT8;
+  is_bytes_ =
+      !is_described_ && kind_ == Kind::array && descr->subarray->base->type_num == NPY_UINT8;
 }
 
 py::object ValueType::new_array() const { return make_array(dtype_, 0, nullptr, nullptr, 0); }
@@ -110,7 +110,9 @@ bool ValueType::has_shape(PyObject* object) const {
   auto* const array = reinterpret_cast<PyArrayObject*>(object);
   const PyArray_ArrayDescr* const wanted = descr_of(dtype_)->subarray;
   if (!PyArray_EquivTypes(PyArray_DESCR(array), wanted->base)) return false;
-  if (is_bytes_) return PyArray_NDIM(array) == 1 && static_cast<std::size_t>(PyArray_NBYTES(array)) <= payload_bytes_;
+  if (is_bytes_)
+    return PyArray_NDIM(array) == 1 &&
+           static_cast<std::size_t>(PyArray_NBYTES(array)) <= payload_bytes_;
   const auto shape = py::reinterpret_borrow<py::tuple>(wanted->shape);
   if (static_cast<std::size_t>(PyArray_NDIM(array)) != shape.size()) return false;
   for (int i = 0; i < PyArray_NDIM(array); ++i) {
@@ -137,7 +139,8 @@ std::span<const std::byte> ValueType::payload_of(py::handle value, py::object& k
     if (kind_ != Kind::array && PyArray_NDIM(array) == 0 && is_same(PyArray_DESCR(array))) {
       return {data_of(keeper), payload_bytes_};
     }
-    if (kind_ == Kind::array && PyArray_IS_C_CONTIGUOUS(array) && has_shape(keeper.ptr())) return bytes_of(keeper);
+    if (kind_ == Kind::array && PyArray_IS_C_CONTIGUOUS(array) && has_shape(keeper.ptr()))
+      return bytes_of(keeper);
   }
   keeper = types("pack")(value, dtype_, is_described_);
   return bytes_of(keeper);
@@ -154,7 +157,9 @@ void check_type(const StreamId& id, const TypeInfo& type, const WantedType& want
   TypeInfo has = type, wants = *wanted.type;
   if (has.name.empty() || wants.name.empty()) {
     // Only types with names are compared by their fields and alignments.
-    const std::string name = !has.name.empty() ? has.name : !wants.name.empty() ? wants.name : "unnamed";
+    const std::string name = !has.name.empty()     ? has.name
+                             : !wants.name.empty() ? wants.name
+                                                   : "unnamed";
     has.name = wants.name = name;
     wants.alignment_bytes = has.alignment_bytes;
   }
@@ -168,8 +173,7 @@ namespace {
 // --- Sample
 
 struct SampleObject {
-  PyObject_HEAD
-  SampleInfo info;
+  PyObject_HEAD SampleInfo info;
   PyObject* value;  // owned
 };
 
@@ -194,8 +198,9 @@ void define_types(py::module_& module) {
            py::arg("name"), py::arg("kind"), py::arg("offset_bytes"), py::arg("count") = 1,
            py::arg("stride_bytes") = 0, "A field; kind: 'float64', 'uint8', 'bool', 'char' ...")
       .def_readonly("name", &Field::name, "Its name, such as 'pose.x'.")
-      .def_property_readonly("kind", [](const Field& field) { return std::string(name_of(field.kind)); },
-                             "The type of its elements, such as 'float64'.")
+      .def_property_readonly(
+          "kind", [](const Field& field) { return std::string(name_of(field.kind)); },
+          "The type of its elements, such as 'float64'.")
       .def_readonly("offset_bytes", &Field::offset_bytes, "Where it begins in the payload.")
       .def_readonly("count", &Field::count, "The number of its elements.")
       .def_readonly("stride_bytes", &Field::stride_bytes, "The distance between two elements.")
@@ -214,18 +219,22 @@ void define_types(py::module_& module) {
       .def_readonly("payload_bytes", &TypeInfo::payload_bytes, "Of a sample, at most.")
       .def_readonly("alignment_bytes", &TypeInfo::alignment_bytes, "Its alignment in C++.")
       .def_readonly("fields", &TypeInfo::fields, "Its fields; empty: not described.")
-      .def_property_readonly("dtype", [](const TypeInfo& type) { return types("dtype_of")(type); },
-                             "The numpy.dtype of its values.")
-      .def("__eq__", [](const TypeInfo& a, const TypeInfo& b) { return a == b; }, py::arg("other"),
-           py::is_operator())
+      .def_property_readonly(
+          "dtype", [](const TypeInfo& type) { return types("dtype_of")(type); },
+          "The numpy.dtype of its values.")
+      .def(
+          "__eq__", [](const TypeInfo& a, const TypeInfo& b) { return a == b; }, py::arg("other"),
+          py::is_operator())
       .def("__str__", &TypeInfo::description)
-      .def("__repr__", [](const TypeInfo& type) { return "<dssm.TypeInfo " + type.description() + ">"; });
+      .def("__repr__",
+           [](const TypeInfo& type) { return "<dssm.TypeInfo " + type.description() + ">"; });
 }
 
 PyGetSetDef sample_attributes[] = {
-    {"tid", [](PyObject* self, void*) { return PyLong_FromLongLong(sample_of(self).info.tid); }, nullptr,
-     "Its number in the stream: 0, 1, 2 ...", nullptr},
-    {"time_ns", [](PyObject* self, void*) { return PyLong_FromLongLong(to_ns(sample_of(self).info.time)); },
+    {"tid", [](PyObject* self, void*) { return PyLong_FromLongLong(sample_of(self).info.tid); },
+     nullptr, "Its number in the stream: 0, 1, 2 ...", nullptr},
+    {"time_ns",
+     [](PyObject* self, void*) { return PyLong_FromLongLong(to_ns(sample_of(self).info.time)); },
      nullptr, "When it was measured, by the writer's clock: ns since 1970.", nullptr},
     {"time",
      [](PyObject* self, void*) -> PyObject* {
@@ -240,27 +249,33 @@ PyGetSetDef sample_attributes[] = {
      },
      nullptr, "time_ns as a numpy.datetime64[ns].", nullptr},
     {"clock_error_ns",
-     [](PyObject* self, void*) { return PyLong_FromLongLong(to_ns(sample_of(self).info.clock_error)); }, nullptr,
-     "Bound on the error of time_ns [ns]; UNKNOWN_CLOCK_ERROR, FOREIGN_CLOCK.", nullptr},
+     [](PyObject* self, void*) {
+       return PyLong_FromLongLong(to_ns(sample_of(self).info.clock_error));
+     },
+     nullptr, "Bound on the error of time_ns [ns]; UNKNOWN_CLOCK_ERROR, FOREIGN_CLOCK.", nullptr},
     {"payload_bytes",
-     [](PyObject* self, void*) { return PyLong_FromUnsignedLongLong(sample_of(self).info.payload_bytes); },
+     [](PyObject* self, void*) {
+       return PyLong_FromUnsignedLongLong(sample_of(self).info.payload_bytes);
+     },
      nullptr, "The length of its payload; fields beyond it are 0.", nullptr},
-    {"info", [](PyObject* self, void*) { return py::cast(sample_of(self).info).release().ptr(); }, nullptr,
-     "What it has besides its value.", nullptr},
+    {"info", [](PyObject* self, void*) { return py::cast(sample_of(self).info).release().ptr(); },
+     nullptr, "What it has besides its value.", nullptr},
     {"value",
      [](PyObject* self, void*) {
        Py_INCREF(sample_of(self).value);
        return sample_of(self).value;
      },
      nullptr,
-     "A numpy.record with the fields, as value['x'] or value.x; a scalar or an array for a stream of "
+     "A numpy.record with the fields, as value['x'] or value.x; a scalar or an array for a stream "
+     "of "
      "such; an array of bytes for one without a description.",
      nullptr},
     {},
 };
 
 PyObject* sample_repr(PyObject* self) {
-  return PyUnicode_FromFormat("Sample(%s, value=%S)", repr_of(sample_of(self).info).c_str(), sample_of(self).value);
+  return PyUnicode_FromFormat("Sample(%s, value=%S)", repr_of(sample_of(self).info).c_str(),
+                              sample_of(self).value);
 }
 
 void sample_dealloc(PyObject* self) {
@@ -309,10 +324,12 @@ void define_values(py::module_& module) {
   define_types(module);
   py::class_<SampleInfo>(module, "SampleInfo", "What a sample has besides its value.")
       .def_readonly("tid", &SampleInfo::tid, "Its number in the stream: 0, 1, 2 ...")
-      .def_property_readonly("time_ns", [](const SampleInfo& info) { return to_ns(info.time); },
-                             "When it was measured, by the writer's clock: ns since 1970.")
-      .def_property_readonly("clock_error_ns", [](const SampleInfo& info) { return to_ns(info.clock_error); },
-                             "Bound on the error of time_ns [ns]; UNKNOWN_CLOCK_ERROR, FOREIGN_CLOCK.")
+      .def_property_readonly(
+          "time_ns", [](const SampleInfo& info) { return to_ns(info.time); },
+          "When it was measured, by the writer's clock: ns since 1970.")
+      .def_property_readonly(
+          "clock_error_ns", [](const SampleInfo& info) { return to_ns(info.clock_error); },
+          "Bound on the error of time_ns [ns]; UNKNOWN_CLOCK_ERROR, FOREIGN_CLOCK.")
       .def_readonly("payload_bytes", &SampleInfo::payload_bytes, "The length of its payload.")
       .def("__repr__", [](const SampleInfo& info) { return "SampleInfo(" + repr_of(info) + ")"; });
   define_sample(module);

@@ -13,7 +13,8 @@ namespace dssm::python {
 struct Writer {
   Writer(RawWriter writer, const WantedType& wanted)
       : raw(std::move(writer)),
-        values(wanted.dtype.is_none() ? ValueType(raw->type()) : ValueType(raw->type(), wanted.dtype)) {
+        values(wanted.dtype.is_none() ? ValueType(raw->type())
+                                      : ValueType(raw->type(), wanted.dtype)) {
     check_type(raw->id(), raw->type(), wanted);
   }
   std::optional<RawWriter> raw;  // empty: closed

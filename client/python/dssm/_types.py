@@ -180,10 +180,8 @@ def type_and_dtype(wanted: Any) -> tuple[TypeInfo, np.dtype]:
     fields: list[Field] = []
     _append(fields, dtype, "", 0)
     alignment = max((_size(field) for field in fields), default=1)
-    sizes = [dtype.itemsize, *(offset for field in fields for offset in (field.offset_bytes, field.stride_bytes))]
-    aligned = dtype.names is None or dtype.isalignedstruct or all(size % alignment == 0 for size in sizes[:1])
-    if not aligned or any(field.offset_bytes % _size(field) for field in fields):
-        alignment = 1
+    if dtype.itemsize % alignment or any(field.offset_bytes % _size(field) for field in fields):
+        alignment = 1  # packed
     if _is_bytes(dtype):
         return TypeInfo(name, dtype.itemsize, 1, []), np.dtype(("u1", (dtype.itemsize,)))
     return TypeInfo(name, dtype.itemsize, alignment, fields), _as_record(dtype)
