@@ -8,7 +8,9 @@
 //   threads  all functions need the GIL; only what runs inside without_gil() does not have it
 #pragma once
 
+#include <cxxabi.h>
 #include <pybind11/pybind11.h>
+#include <unistd.h>
 
 #include <algorithm>
 #include <dssm/error.hpp>
@@ -34,10 +36,32 @@ T value_of(Result<T> result) {
   if constexpr (!std::is_void_v<T>) return *std::move(result);
 }
 
+// While it exists, this thread does not have the GIL.
+//
+// At the end of the process Python ends a thread that asks for the GIL, by pthread_exit(). With
+// pybind11's class of that purpose this ends the process with an error; here the thread sleeps
+// until the process has ended, as in later versions of Python.
+class GilRelease {
+ public:
+  GilRelease() : state_(PyEval_SaveThread()) {}
+  GilRelease(const GilRelease&) = delete;
+  GilRelease& operator=(const GilRelease&) = delete;
+  ~GilRelease() {
+    try {
+      PyEval_RestoreThread(state_);
+    } catch (const abi::__forced_unwind&) {
+      for (;;) ::pause();
+    }
+  }
+
+ private:
+  PyThreadState* state_;
+};
+
 // Calls `call` without the GIL.
 template <class Call>
-auto without_gil(Call call) {
-  const py::gil_scoped_release released;
+auto without_gil(Call call) -> decltype(call()) {
+  const GilRelease released;
   return call();
 }
 // The same for a function that returns a Result: its value, or an exception.

@@ -7,12 +7,15 @@
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
+#include <chrono>
+#include <cmath>
 #include <condition_variable>
 #include <cstdio>
 #include <dssm/session.hpp>
 #include <memory>
 #include <mutex>
 #include <optional>
+#include <thread>
 
 #include "client/python/reader.hpp"
 #include "client/python/writer.hpp"
@@ -81,7 +84,7 @@ RawReader await_reader(Connection& connection, const StreamId& id, MonoTime dead
       std::make_unique<Session::Watch>(value_without_gil([&] { return session.watch(on_event); }));
   // Its end waits for a running callback.
   const auto end_watch = [](Session::Watch* ended) {
-    const py::gil_scoped_release released;
+    const GilRelease released;
     delete ended;
   };
   const std::unique_ptr<Session::Watch, decltype(end_watch)> watching(watch.release(), end_watch);
@@ -245,30 +248,53 @@ void define_session_infos(py::module_& module) {
       .def_readonly("memory_limit_bytes", &DaemonInfo::memory_limit_bytes, "For all rings.");
 }
 
+// Rounded up; at most an hour, after which the caller checks again.
+Duration to_nanoseconds(double seconds) {
+  return std::chrono::ceil<Duration>(std::chrono::duration<double>(std::min(seconds, 3600.0)));
+}
+
+// PlaybackClock::sleep_until() does the same, but a signal between two calls does not interrupt it.
+void sleep_until(const PlaybackClock& clock, double time_s) {
+  for (;;) {
+    const PlaybackClock::Setting setting = clock.setting();
+    const double left_s = setting.speed < 0 ? clock.now_s() - time_s : time_s - clock.now_s();
+    if (left_s <= 0) return;
+    constexpr double kMaxSleepS = 0.01;  // follows each change of the clock within this time
+    const bool runs = !setting.paused && setting.speed != 0;
+    const double real_s =
+        runs ? std::min(left_s / std::abs(setting.speed), kMaxSleepS) : kMaxSleepS;
+    without_gil([&] {
+      if (!sleep_in_lockstep(to_nanoseconds(left_s))) {
+        std::this_thread::sleep_for(to_nanoseconds(real_s));
+      }
+    });
+    if (PyErr_CheckSignals() != 0) throw py::error_already_set();
+  }
+}
+
 void define_playback_clock(py::module_& module) {
   py::class_<PlaybackClock>(
       module, "PlaybackClock",
       "The PC's playback clock: real time, or what a player of recordings sets. "
       "Times are float seconds since 1970.")
       .def("now", &PlaybackClock::now_s, "The time of the clock [s].")
+      .def("sleep_until", &sleep_until, py::arg("time"),
+           "Waits until now() has reached `time` [s].")
       .def(
-          "sleep_until",
-          [](const PlaybackClock& clock, double time_s) {
-            // A signal ends the wait, so that its handler in Python runs.
-            while (without_gil([&] { return clock.sleep_until(time_s); }) != WaitStatus::ready) {
-              if (PyErr_CheckSignals() != 0) throw py::error_already_set();
-            }
-          },
-          py::arg("time"), "Waits until now() has reached `time` [s].")
-      .def("reset", &PlaybackClock::reset, "Shows the real time.",
-           py::call_guard<py::gil_scoped_release>())
-      .def("set_time", &PlaybackClock::set_time, py::arg("time"), "Sets now() to `time` [s].",
-           py::call_guard<py::gil_scoped_release>())
-      .def("set_speed", &PlaybackClock::set_speed, py::arg("speed"),
-           "1: real time; 0: stands still; negative: backwards.",
-           py::call_guard<py::gil_scoped_release>())
-      .def("set_paused", &PlaybackClock::set_paused, py::arg("paused"), "Stops it, or continues.",
-           py::call_guard<py::gil_scoped_release>())
+          "reset", [](PlaybackClock& clock) { without_gil([&] { clock.reset(); }); },
+          "Shows the real time.")
+      .def(
+          "set_time",
+          [](PlaybackClock& clock, double time_s) { without_gil([&] { clock.set_time(time_s); }); },
+          py::arg("time"), "Sets now() to `time` [s].")
+      .def(
+          "set_speed",
+          [](PlaybackClock& clock, double speed) { without_gil([&] { clock.set_speed(speed); }); },
+          py::arg("speed"), "1: real time; 0: stands still; negative: backwards.")
+      .def(
+          "set_paused",
+          [](PlaybackClock& clock, bool paused) { without_gil([&] { clock.set_paused(paused); }); },
+          py::arg("paused"), "Stops it, or continues.")
       .def_property_readonly(
           "speed", [](const PlaybackClock& clock) { return clock.setting().speed; }, "Its speed.")
       .def_property_readonly(
