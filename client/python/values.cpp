@@ -86,7 +86,7 @@ py::object ValueType::value_of(const py::object& array, const SampleInfo& info) 
 }
 
 py::object ValueType::view(std::span<const std::byte> payload, const py::object& owner) const {
-  const py::object array = make_view(dtype_, 0, nullptr, payload, owner);
+  py::object array = make_view(dtype_, 0, nullptr, payload, owner);
   if (kind_ != Kind::record) return array;
   PyObject* const record = PyArray_Scalar(data_of(array), descr_of(dtype_), array.ptr());
   if (!record) throw py::error_already_set();

@@ -1,9 +1,8 @@
-#!/usr/bin/python3
 # SPDX-License-Identifier: Apache-2.0
 """Draws a stream while it is written: each field that is a number, over the last seconds.
 
-    plot_stream.py STREAM                  opens a window
-    plot_stream.py STREAM --out FILE.png   draws the next --seconds into a file
+    python3 plot_stream.py STREAM                  opens a window
+    python3 plot_stream.py STREAM --out FILE.png   draws the next --seconds into a file
 
 Needs matplotlib: apt-get install python3-matplotlib.
 """
