@@ -30,7 +30,7 @@ ORDER = [
     ["client/include"],
     ["client/src"],
     ["client/ssm", "client/recording"],
-    ["client/dssmctl"],
+    ["client/dssmctl", "client/python"],
     ["client/view"],
     ["daemon/base"],
     ["daemon/service"],
@@ -49,6 +49,7 @@ ONLY = {
     "client/include": ["core/include"],
     "client/ssm": ["core/include", "client/include", "core/base"],
     "client/recording": ["core/include", "client/include", "core/base"],
+    "client/python": ["core/include", "client/include"],
     # dssmctl: besides the public headers the names of streams, the names and ids of hosts, which
     # certificates hold, the format of SSM's logs, and the memory that it shares with programs in
     # lockstep.
