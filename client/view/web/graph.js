@@ -12,9 +12,9 @@ const kGap = 14; // within a layer
 const kMargin = 6;
 const kSweeps = 8;
 const kNarrow = 560;
-const kMaxText = 20;
+const kMaxText = 18;
 const kNarrowBoxWidth = 104;
-const kNarrowMaxText = 13;
+const kNarrowMaxText = 12;
 const kBackBend = 22; // of an arrow to an earlier layer, which passes beside the boxes
 const kWay = 12; // what a long arrow takes up in the layers that it passes
 

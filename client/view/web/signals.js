@@ -403,7 +403,10 @@ export class Signals extends EventTarget {
     // What was live a moment ago hardly moves; otherwise the instant is near that end.
     const near = this.window && t > this.window.to && t - this.window.to < span / 10n;
     const before = there && t < this.window.from ? span / 10n : near ? span : (span * 9n) / 10n;
-    this.window = { from: t - before, to: t - before + span };
+    let from = t - before;
+    const oldest = this.time.range?.oldest;
+    if (!near && oldest !== undefined && from < oldest && oldest <= t) from = oldest;
+    this.window = { from, to: from + span };
     if (this.zoom) this.zoom = this.window;
   }
 
@@ -511,13 +514,21 @@ export class Signals extends EventTarget {
     for (const stream of new Set(panel.signals.map((signal) => signal.stream))) {
       const answer = this.answers.get(stream);
       if (!answer) continue;
-      if (answer.status !== "ok") notes.push(`${stream}: ${answer.error || answer.status}`);
-      else if (answer.error) notes.push(answer.error);
-      else if ([...answer.curves.values()].every((curve) => curve.times.length === 0))
-        notes.push(`${stream}: no samples in this window`);
+      // A window may begin before the oldest sample, and end after the newest one.
+      const isUsual = ["ok", "too_old", "not_yet"].includes(answer.status);
+      const isEmpty = [...answer.curves.values()].every((curve) => !this.isInWindow(answer, curve));
+      if (answer.error) notes.push(answer.error);
+      else if (!isUsual) notes.push(`${stream}: ${answer.status.replaceAll("_", " ")}`);
+      else if (isEmpty) notes.push(`${stream}: no samples in this window`);
       if (answer.lost > 0) notes.push(`${stream}: ${answer.lost} samples lost in this window`);
     }
     return notes.join("; ");
+  }
+
+  isInWindow(answer, curve) {
+    const [from, to] = this.windowX();
+    const start = this.toX(answer.from);
+    return curve.times.some((time) => start + time >= from && start + time <= to);
   }
 
   // The samples at the shown instant, from the page's `at` request.
@@ -584,6 +595,7 @@ export class Signals extends EventTarget {
   // All samples of the window, each stream's tid and fields in columns of their own.
   async exportCsv() {
     if (!this.window) return;
+    const { from, to } = this.window;
     const rows = new Map(); // ns -> cells
     const columns = ["time_ns"];
     for (const stream of this.chosenStreams()) {
@@ -594,8 +606,9 @@ export class Signals extends EventTarget {
       for (const [field, curve] of answer.curves) {
         const column = columns.push(`${stream} ${field}`) - 1;
         for (let i = 0; i < curve.times.length; ++i) {
-          if (Number.isNaN(curve.values[i]) && Number.isNaN(curve.tids[i])) continue;
           const ns = answer.from + BigInt(Math.round(curve.times[i] * 1e9));
+          const isThere = !Number.isNaN(curve.values[i]) && ns >= from && ns <= to;
+          if (!isThere) continue;
           if (!rows.has(ns)) rows.set(ns, []);
           rows.get(ns)[tidColumn] = curve.tids[i];
           rows.get(ns)[column] = curve.values[i];

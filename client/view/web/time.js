@@ -159,6 +159,7 @@ export class TimeBar {
   updateSlider() {
     const { oldest, newest } = this.time.range;
     const end = newest > oldest ? newest : oldest + 1n;
+    this.root.dataset.oldestNs = String(oldest);
     this.slider.max = String(end - oldest);
     const t = this.time.t ?? end;
     this.slider.value = String(t - oldest);

@@ -164,7 +164,7 @@ def signal(page, stream, field):
     page.wait("a curve", lambda: int(page.get(".panel", "data-points") or 0) > 20)
     page.press(" ")
     page.wait("held", lambda: page.get("#time", "data-mode") == "hold")
-    t = page.wait("the held instant", lambda: page.get("#shown-t", "data-t-ns"))
+    t = page.wait("the held instant", lambda: page.get("#time", "data-t-ns"))
     held = page.wait("settled", lambda: page.get("#shown-t", "data-t-ns") == t and shown())
     before = newest()
     page.wait("the stream goes on", lambda: newest() > max(before, held) + 20)
@@ -186,9 +186,13 @@ def slider(page, *streams):
 
     page.wait("samples", lambda: all(tids()))
     for part in [0.3, 0.55, 0.8, 0.9]:
-        page.run("const slider = document.getElementById('slider');"
-                 "slider.value = Math.round(arguments[0] * Number(slider.max));"
-                 "slider.dispatchEvent(new Event('input'))", part)
+        place, held = page.run(
+            "const slider = document.getElementById('slider');"
+            "const {dataset} = document.getElementById('time');"
+            "const place = slider.value = Math.round(arguments[0] * Number(slider.max));"
+            "slider.dispatchEvent(new Event('input'));"
+            "return [place, Number(BigInt(dataset.tNs) - BigInt(dataset.oldestNs))]", part)
+        assert place == held, f"the slider is at {place} ns, the held instant at {held} ns"
         page.wait("held", lambda: page.get("#time", "data-mode") == "hold")
         say("at", settled(page, streams), *tids())
     before = tids()
