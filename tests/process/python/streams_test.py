@@ -395,6 +395,7 @@ class Reads(Case):
     def test_history_leaves_a_new_reader_new(self):
         self.fill(3)
         self.assertEqual(len(self.reader.history(0, T0 + 9 * SECOND)), 3)
+        self.reader.at(T0)  # nor does a read by time after it
         self.assertEqual(self.reader.next().tid, 2)
 
     def test_history_has_no_shared_memory(self):

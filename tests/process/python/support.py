@@ -33,7 +33,8 @@ class Daemon:
             ready.bind(notify)
             ready.settimeout(PATIENT_S)
             self._process = subprocess.Popen(
-                [BUILD / "daemon/dssmd", "--runtime-dir", self._folder, "--name", "pc1", "--chronyd", "127.0.0.1:1",
+                # It ends with the test, also if that crashes.
+                ["setpriv", "--pdeathsig", "KILL", BUILD / "daemon/dssmd", "--runtime-dir", self._folder, "--name", "pc1", "--chronyd", "127.0.0.1:1",
                  "--mdns=false", "--listen", "127.0.0.1:0"], env=os.environ | {"NOTIFY_SOCKET": notify})
             while b"READY=1" not in ready.recv(4096):
                 pass
