@@ -63,10 +63,16 @@ SignalRange read_signals(RawReader& reader, const std::vector<ctl::FieldElement>
   // The samples before and after the range, so that a line enters and leaves it.
   SampleInfo info;
   Tid first = reader.oldest_tid();
-  range.status = reader.find(from, info);
-  if (range.status == ReadStatus::ok) first = info.tid;
+  const ReadStatus at_begin = reader.find(from, info);
+  if (at_begin == ReadStatus::ok) first = info.tid;
+  if (at_begin == ReadStatus::arriving) range.status = at_begin;
   Tid last = reader.newest_tid();
-  if (reader.find(to, info) == ReadStatus::ok) last = std::min(last, info.tid + 1);
+  const ReadStatus at_end = reader.find(to, info);
+  if (at_end == ReadStatus::ok) last = std::min(last, info.tid + 1);
+  if (at_end == ReadStatus::too_old) {  // the ring has nothing of that time any more
+    range.status = at_end;
+    return range;
+  }
   if (first == kNoTid || last == kNoTid) return range;
   first = std::max(first, last - static_cast<Tid>(kMaxSignalSamples));
 

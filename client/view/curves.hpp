@@ -57,11 +57,13 @@ class CurveBuilder {
 
 // What a reader's ring holds of a range of time.
 struct SignalRange {
-  ReadStatus status = ReadStatus::ok;  // arriving: another host's history is on its way; restarted
-  std::uint64_t samples = 0;           // that were read
-  std::uint64_t lost = 0;              // that are missing between them
-  Duration clock_error{};              // the greatest bound; kUnknownClockError: unknown
-  std::vector<Curve> curves;           // of each field
+  // arriving: another host's history is on its way; too_old: all of it is older than the ring's
+  // samples; restarted: nothing was read.
+  ReadStatus status = ReadStatus::ok;
+  std::uint64_t samples = 0;  // that were read
+  std::uint64_t lost = 0;     // that are missing between them
+  Duration clock_error{};     // the greatest bound; kUnknownClockError: unknown
+  std::vector<Curve> curves;  // of each field
 };
 
 // At most so many samples are read, the last ones of the range.

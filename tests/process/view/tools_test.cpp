@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// dssm-view as other tools meet it: Foxglove's own client (foxglove/client.cjs), and a real Prometheus.
+// dssm-view as other tools meet it: Foxglove's own client (foxglove/client.cjs), and a real
+// Prometheus.
 #include <filesystem>
 #include <fstream>
 #include <regex>

@@ -251,6 +251,19 @@ TEST_F(View, LosesNoPeakOfASignal) {
   EXPECT_EQ(part["curves"][0]["tids"].front(), 100) << part;
   EXPECT_EQ(part["curves"][0]["tids"].back(), 111) << part;
   EXPECT_EQ(part["curves"][0]["points"], 12) << part;
+  // From before the ring's first sample on; and nothing of what is wholly before it.
+  const auto from_zero_to = [&](std::int64_t to_ns) {
+    return ask({{"op", "signals"},
+                {"stream", "motion:0@pc1"},
+                {"fields", {"wheel"}},
+                {"from_ns", "0"},
+                {"to_ns", std::to_string(to_ns)},
+                {"points", 200}});
+  };
+  EXPECT_EQ(from_zero_to(kSecond + 500)["status"], "ok");
+  EXPECT_EQ(from_zero_to(kSecond + 500)["curves"][0]["tids"].front(), 0);
+  EXPECT_EQ(from_zero_to(kSecond - 500)["status"], "too_old");
+  EXPECT_TRUE(from_zero_to(kSecond - 500)["curves"].empty());
 }
 
 TEST_F(View, FollowsAStreamThatIsCreatedAgain) {
