@@ -12,7 +12,7 @@ namespace {
 
 using namespace std::chrono_literals;
 
-constexpr double kNone = std::numeric_limits<double>::quiet_NaN();
+constexpr double kNotANumber = std::numeric_limits<double>::quiet_NaN();
 
 TEST(CurveBuilder, KeepsTheLeastAndTheGreatestOfEachSlice) {
   CurveBuilder builder(10s, 10);
@@ -47,7 +47,7 @@ TEST(CurveBuilder, BreaksWhereSamplesAreMissing) {
   builder.add(1s, 1, 1, false);
   builder.add(2s, 2, 2, false);
   builder.add(5s, 5, 5, true);
-  builder.add(6s, 6, kNone, false);
+  builder.add(6s, 6, kNotANumber, false);
   builder.add(7s, 7, 7, false);
   const Curve curve = builder.take();
   ASSERT_EQ(curve.values.size(), 6U);
