@@ -7,6 +7,8 @@
 // Labels are names of hosts, streams and limits only, so that the number of series is bounded by
 // that of the streams. What is not known has no sample, as the streams of a host that does not
 // answer.
+#include "client/dssmctl/metrics.hpp"
+
 #include <fmt/format.h>
 #include <unistd.h>
 
@@ -21,7 +23,6 @@
 #include <utility>
 #include <vector>
 
-#include "client/dssmctl/metrics.hpp"
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/options.hpp"
 #include "core/base/time.hpp"

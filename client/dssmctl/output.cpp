@@ -221,8 +221,8 @@ std::string line_of(const std::vector<Table::Column>& columns, const Layout& lay
 }
 
 std::string header_of(const std::vector<Table::Column>& columns, const Layout& layout) {
-  std::vector<std::string> titles;
-  for (const Table::Column& column : columns) titles.push_back(column.title);
+  std::vector<std::string> titles(columns.size());
+  std::ranges::transform(columns, titles.begin(), &Table::Column::title);
   return line_of(columns, layout, titles);
 }
 

@@ -107,8 +107,8 @@ std::string identity(const NodeInfo& program) {
 
 template <class Item>
 std::vector<std::string> identities(const std::vector<Item>& items) {
-  std::vector<std::string> all;
-  for (const Item& item : items) all.push_back(identity(item));
+  std::vector<std::string> all(items.size());
+  std::ranges::transform(items, all.begin(), [](const Item& item) { return identity(item); });
   return all;
 }
 

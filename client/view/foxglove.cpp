@@ -25,7 +25,9 @@ constexpr int kMaxTurnSamples = 200;
 constexpr Duration kTimePeriod = std::chrono::milliseconds(50);
 constexpr Duration kLossReportPeriod = std::chrono::seconds(2);
 
-enum : unsigned char { kMessageData = 1, kTime = 2 };
+// The first byte of a binary message.
+constexpr unsigned char kMessageData = 1;
+constexpr unsigned char kTime = 2;
 
 template <class Number>
 void put(std::vector<std::byte>& out, Number number) {

@@ -11,6 +11,7 @@
 #include <array>
 #include <cerrno>
 #include <cstring>
+#include <system_error>
 #include <utility>
 
 #include "client/dssmctl/text.hpp"
@@ -186,7 +187,8 @@ Result<std::uint16_t> Server::listen() {
   };
   library.protocols.push_back({"http", callback, sizeof(std::uint64_t), 0, 0, nullptr, 0});
   for (const auto& [name, connect] : endpoints_) {
-    library.protocols.push_back({name.c_str(), callback, sizeof(WebSocket*), 4096, 0, nullptr, 0});
+    constexpr std::size_t kPointerBytes = sizeof(void*);  // of a WebSocket
+    library.protocols.push_back({name.c_str(), callback, kPointerBytes, 4096, 0, nullptr, 0});
   }
   library.protocols.push_back({});
 
@@ -216,10 +218,11 @@ Result<std::uint16_t> Server::listen() {
   }
   context_ = lws_create_context(&info);
   if (!context_) {
-    return Error{Errc::system,
-                 fmt::format("listen on {}:{}: {}; is another dssm-view running, or is that not an "
-                             "address of this PC?",
-                             options_.address, options_.port, std::strerror(errno))};
+    return Error{
+        Errc::system,
+        fmt::format("listen on {}:{}: {}; is another dssm-view running, or is that not an "
+                    "address of this PC?",
+                    options_.address, options_.port, std::generic_category().message(errno))};
   }
   for (const auto& timer : timers_) timer->schedule();
   return static_cast<std::uint16_t>(
