@@ -369,8 +369,9 @@ class Card {
     setText(foot.tid, sample.tid === null ? sample.status : `tid ${sample.tid}`);
     setText(foot.time, sample.timeNs === null ? "" : timeOfDay(sample.timeNs));
     const age = sample.timeNs === null ? 0n : t - sample.timeNs;
-    setText(foot.age, age === 0n ? "" : `${duration(age)} before`);
-    foot.age.title = "Before the shown instant";
+    const distance = duration(age < 0n ? -age : age);
+    setText(foot.age, age === 0n ? "" : `${distance} ${age < 0n ? "after" : "before"}`);
+    foot.age.title = "Of the shown instant";
     setText(
       foot.error,
       sample.clockErrorNs === null ? "" : `\u00b1${duration(sample.clockErrorNs)}`,
@@ -419,6 +420,7 @@ class Card {
         answer.doubles(y.times_at, y.points),
         answer.doubles(y.values_at, y.points),
       );
+      this.element.dataset.trailPoints = String(x.points);
       if (this.samples) this.show(this.t, this.samples);
     } catch (error) {
       if (!(error instanceof RequestError)) throw error;

@@ -262,6 +262,23 @@ def views(page, scan, pose, image, raw):
     page.shot("views-dark")
 
 
+def drive(page, scan, pose):
+    """The scans of a drive are placed by their poses, also in the past."""
+    page.show_as((1280, 600), "light")  # the picture of docs/view.png
+    page.open("views", views=[{"stream": scan, "place": pose}, {"stream": pose, "trail": 60}])
+    page.wait("scans", lambda: int(page.get(card(scan), "data-tid") or -1) > 150)
+    page.press(" ")
+    page.run("const slider = document.getElementById('slider');"
+             "slider.value = Math.round(0.95 * Number(slider.max));"
+             "slider.dispatchEvent(new Event('input'))")
+    settled(page, [scan, pose])
+    page.wait("the pose of the scan", lambda: page.get(card(scan), "data-tid") ==
+              page.get(card(pose), "data-tid"))
+    for stream in [scan, pose]:
+        page.wait("the trail", lambda: int(page.get(card(stream), "data-trail-points") or 0) > 50)
+    page.shot("drive")
+
+
 def host_down(page, host):
     """Prints "ready" when `host` is up, and ends when the page shows that it is down."""
     page.open("overview")
@@ -306,7 +323,7 @@ def phone(page, stream):
 
 
 CHECKS = {check.__name__: check for check in
-          [overview, signal, slider, link, views, host_down, reconnect, phone]}
+          [overview, signal, slider, link, views, drive, host_down, reconnect, phone]}
 
 
 def main(check, url, folder, *arguments):

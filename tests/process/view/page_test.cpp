@@ -5,6 +5,7 @@
 #include <signal.h>
 
 #include <cmath>
+#include <filesystem>
 #include <optional>
 
 #include "tests/process/view/view_fixture.hpp"
@@ -142,6 +143,25 @@ TEST_F(ViewPage, DrawsScansPosesImagesAndBytes) {
       session_.create_raw({"raw", 0, ""}, TypeInfo{"", some.size(), 1, {}}, depth_of(8)).value();
   raw.write(some);
   expect_ok("views", {"scan:0@pc1", "pose:0@pc1", "camera:0@pc1", "raw:0@pc1"});
+}
+
+// Its first 50 seconds, all of which the rings hold.
+TEST_F(ViewPage, ShowsTheDriveOfTheExample) {
+  const std::string programs = "docs/examples/vehicle/";
+  if (!std::filesystem::exists(built(programs + "lidar"))) {
+    GTEST_SKIP() << "the example is not built";
+  }
+  const std::string start_at =
+      std::to_string(to_ns(WallClock::now() + std::chrono::seconds(1)) / kSecond);
+  const auto replay = [&](const std::string& program, const DaemonProcess& dssmd) {
+    return Running(
+        {built(programs + program), "--log", source(programs + "data/freiburg-079.carmen.log.gz"),
+         "--speed", "20", "--to", "50", "--start-at", start_at},
+        {dssmd.environment()});
+  };
+  Running localizer({built(programs + "localizer")}, {daemon_.environment()});
+  Running encoder = replay("encoder", daemon_), lidar = replay("lidar", pc2_);
+  expect_ok("drive", {"lidar:0@pc2", "pose:0@pc1"});
 }
 
 TEST_F(ViewPage, ShowsThatAHostIsDown) {
