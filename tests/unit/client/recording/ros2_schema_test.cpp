@@ -5,12 +5,17 @@
 
 #include <gtest/gtest.h>
 
+#include <cstring>
 #include <dssm/describe.hpp>
 #include <map>
 #include <random>
 #include <regex>
 #include <set>
 #include <sstream>
+#include <vector>
+#ifdef DSSM_HAS_FASTCDR
+#include <fastcdr/Cdr.h>
+#endif
 
 namespace dssm::recording {
 namespace {
@@ -77,6 +82,61 @@ TEST(Ros2Schema, PadsAndRenames) {
                 "float64 y\n"
                 "uint8[3] tag\n"
                 "uint8[5] pad2\n");
+}
+
+// Fast CDR, with which programs of ROS 2 read, follows that definition through the payload.
+TEST(Ros2Schema, IsHowFastCdrReadsThePayload) {
+#ifdef DSSM_HAS_FASTCDR
+  Scan scan{};
+  scan.kind = 1;
+  scan.fooBar = 2.5;
+  scan.n = 3;
+  scan.range[2] = 4.5F;
+  scan.flags[1] = {true, 5.5};
+  scan.origin = {6.5F, 7.5, "ab"};
+  scan.points[1] = {8.5F, 9.5, "cd"};
+  scan.t = -10;
+  scan.ok = true;
+  scan.last = -11;
+  std::vector<char> message = {0, 1, 0, 0};
+  message.resize(message.size() + sizeof scan);
+  std::memcpy(message.data() + 4, &scan, sizeof scan);
+
+  eprosima::fastcdr::FastBuffer buffer(message.data(), message.size());
+  eprosima::fastcdr::Cdr cdr(buffer, eprosima::fastcdr::Cdr::LITTLE_ENDIANNESS,
+                             eprosima::fastcdr::Cdr::DDS_CDR);
+  cdr.read_encapsulation();
+  const auto skip = [&](std::size_t bytes) {
+    for (std::uint8_t byte = 0; bytes > 0; --bytes) cdr >> byte;
+  };
+  const auto next = [&]<class T>(T value) { return cdr >> value, value; };
+  const auto expect_point = [&](const Point& point) {
+    EXPECT_EQ(next(float()), point.x);
+    skip(4);
+    EXPECT_EQ(next(double()), point.y);
+    for (const char c : point.tag) EXPECT_EQ(next(std::uint8_t()), c);
+    skip(5);
+  };
+  EXPECT_EQ(next(std::uint8_t()), scan.kind);
+  skip(7);
+  EXPECT_EQ(next(double()), scan.fooBar);
+  EXPECT_EQ(next(std::uint16_t()), scan.n);
+  skip(2);
+  for (const float range : scan.range) EXPECT_EQ(next(float()), range);
+  for (const Flag& flag : scan.flags) {
+    EXPECT_EQ(next(bool()), flag.on);
+    skip(7);
+    EXPECT_EQ(next(double()), flag.since);
+  }
+  expect_point(scan.origin);
+  for (const Point& point : scan.points) expect_point(point);
+  EXPECT_EQ(next(std::int64_t()), scan.t);
+  EXPECT_EQ(next(bool()), scan.ok);
+  skip(1);
+  EXPECT_EQ(next(std::int16_t()), scan.last);
+#else
+  GTEST_SKIP() << "Debian's package libfastcdr-dev is not installed";
+#endif
 }
 
 TEST(Ros2Schema, HasSequenceOfBytesForUndescribedTypes) {
