@@ -23,7 +23,7 @@ void CurveBuilder::add(Duration time, Tid tid, double value, bool is_after_gap) 
   const auto slice =
       static_cast<std::uint64_t>(std::clamp(part, 0.0, 1.0) * static_cast<double>(slices_));
   const Point point{time, tid, value};
-  if (!has_points_ || slice != slice_ || std::isnan(value)) {
+  if (!has_points_ || slice != slice_ || std::isnan(value) || std::isnan(least_.value)) {
     end_slice();
     slice_ = slice;
     is_after_gap_ = is_after_gap;
@@ -32,8 +32,8 @@ void CurveBuilder::add(Duration time, Tid tid, double value, bool is_after_gap) 
     return;
   }
   is_after_gap_ = is_after_gap_ || is_after_gap;
-  if (!(least_.value <= value)) least_ = point;
-  if (!(greatest_.value >= value)) greatest_ = point;
+  if (value < least_.value) least_ = point;
+  if (value > greatest_.value) greatest_ = point;
 }
 
 void CurveBuilder::end_slice() {
@@ -74,7 +74,9 @@ SignalRange read_signals(RawReader& reader, const std::vector<ctl::FieldElement>
     return range;
   }
   if (first == kNoTid || last == kNoTid) return range;
-  first = std::max(first, last - static_cast<Tid>(kMaxSignalSamples));
+  const Tid oldest_read = last - static_cast<Tid>(kMaxSignalSamples);
+  range.left_out = static_cast<std::uint64_t>(std::max<Tid>(oldest_read - first, 0));
+  first = std::max(first, oldest_read);
 
   const std::size_t wanted = std::max<std::size_t>(points, 2);
   const bool is_thinned = static_cast<std::uint64_t>(last - first) >= wanted;

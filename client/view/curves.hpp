@@ -13,7 +13,7 @@
 
 namespace dssm::view {
 
-// A curve; its three lists are of the same length. Times rise; a value that is not a number stands
+// A curve; its three lists are of the same length. Times rise; a value that is not a number is
 // before samples that follow lost ones.
 struct Curve {
   std::vector<double> times_s;  // since the beginning of the range
@@ -60,10 +60,11 @@ struct SignalRange {
   // arriving: another host's history is on its way; too_old: all of it is older than the ring's
   // samples; restarted: nothing was read.
   ReadStatus status = ReadStatus::ok;
-  std::uint64_t samples = 0;  // that were read
-  std::uint64_t lost = 0;     // that are missing between them
-  Duration clock_error{};     // the greatest bound; kUnknownClockError: unknown
-  std::vector<Curve> curves;  // of each field
+  std::uint64_t samples = 0;   // that were read
+  std::uint64_t lost = 0;      // that are missing between them
+  std::uint64_t left_out = 0;  // before the first that was read: kMaxSignalSamples
+  Duration clock_error{};      // the greatest bound; kUnknownClockError: unknown
+  std::vector<Curve> curves;   // of each field
 };
 
 // At most so many samples are read, the last ones of the range.

@@ -5,7 +5,8 @@
 
 #include <algorithm>
 #include <array>
-#include <cstring>
+#include <limits>
+#include <optional>
 #include <utility>
 
 #include "client/dssmctl/nodes.hpp"
@@ -20,6 +21,9 @@ using ctl::Json;
 
 // What may wait for one client. A single sample may be larger.
 constexpr std::size_t kMaxWaitingBytes = 1U << 20;
+// With so much more, of answers and lists, the connection is ended.
+constexpr std::size_t kMaxUnread = 64U << 20;
+constexpr std::size_t kMaxSubscriptions = 4096;
 // Of one stream in one turn, so that no other waits long.
 constexpr int kMaxTurnSamples = 200;
 constexpr Duration kTimePeriod = std::chrono::milliseconds(50);
@@ -65,6 +69,7 @@ class FoxgloveConnection : public Connection {
   ~FoxgloveConnection() override { clients_.connections_.erase(this); }
 
   void on_text(std::string_view text) override {
+    if (peer_.waiting_bytes() > kMaxUnread) return peer_.close("messages are not read");
     const Json request = Json::parse(text, nullptr, false);
     const auto op = request.is_object() ? request.find("op") : request.end();
     if (!request.is_object() || op == request.end() || !op->is_string()) {
@@ -73,7 +78,7 @@ class FoxgloveConnection : public Connection {
     if (*op == "subscribe") return subscribe(request);
     if (*op == "unsubscribe") return unsubscribe(request);
     if (*op == "subscribeConnectionGraph") {
-      wants_graph_ = true;
+      if (std::exchange(wants_graph_, true)) return;
       clients_.collector_.want_all();
       return send_graph();
     }
@@ -146,19 +151,27 @@ class FoxgloveConnection : public Connection {
     send({{"op", "status"}, {"level", level}, {"message", text}});
   }
 
+  static std::optional<std::uint32_t> id_of(const Json& json) {
+    if (!json.is_number_unsigned() ||
+        json.get<std::uint64_t>() > std::numeric_limits<std::uint32_t>::max()) {
+      return std::nullopt;
+    }
+    return json.get<std::uint32_t>();
+  }
+
   void subscribe(const Json& request) {
     const auto list = request.find("subscriptions");
     if (list == request.end() || !list->is_array()) return;
     for (const Json& entry : *list) {
       const auto number = [&](const char* key) -> std::optional<std::uint32_t> {
-        if (!entry.is_object() || !entry.contains(key) || !entry[key].is_number_unsigned()) {
-          return std::nullopt;
-        }
-        return entry[key].get<std::uint32_t>();
+        if (!entry.is_object() || !entry.contains(key)) return std::nullopt;
+        return id_of(entry[key]);
       };
       const auto id = number("id"), channel = number("channelId");
       if (!id || !channel || !clients_.channels_.contains(*channel)) {
         report(2, "a subscription names a channel that does not exist");
+      } else if (subscriptions_.size() >= kMaxSubscriptions) {
+        report(2, "too many subscriptions");
       } else if (!subscriptions_.emplace(*id, Subscription{*channel, kNoTid, 0}).second) {
         report(1, fmt::format("there is a subscription {} already", *id));
       }
@@ -169,7 +182,7 @@ class FoxgloveConnection : public Connection {
     const auto list = request.find("subscriptionIds");
     if (list == request.end() || !list->is_array()) return;
     for (const Json& id : *list) {
-      if (id.is_number_unsigned()) subscriptions_.erase(id.get<std::uint32_t>());
+      if (const auto number = id_of(id)) subscriptions_.erase(*number);
     }
   }
 
@@ -203,14 +216,21 @@ class FoxgloveConnection : public Connection {
       if (status == ReadStatus::restarted) return stream->follow_restart();
       if (status == ReadStatus::arriving || status == ReadStatus::not_yet) return;
       ++subscription.next;
-      if (status != ReadStatus::ok) continue;
+      if (status != ReadStatus::ok) {
+        ++left_out_;
+        continue;
+      }
       std::vector<std::byte> message;
       message.reserve(sample.payload().size() + 32);
       put(message, kMessageData);
       put(message, id);
       put(message, recording::log_time_of(sample.info().time));
       put_sample(message, channel->second.type, sample.payload());
-      if (sample.still_valid()) peer_.send(Message::binary({message}));
+      if (sample.still_valid()) {
+        peer_.send(Message::binary({message}));
+      } else {
+        ++left_out_;
+      }
     }
   }
 
@@ -223,8 +243,10 @@ class FoxgloveConnection : public Connection {
   MonoTime next_time_{}, next_report_{};
 };
 
-FoxgloveClients::FoxgloveClients(Streams& streams, StateCollector& collector, PlaybackClock clock)
-    : streams_(streams),
+FoxgloveClients::FoxgloveClients(std::string host, Streams& streams, StateCollector& collector,
+                                 PlaybackClock clock)
+    : host_(std::move(host)),
+      streams_(streams),
       collector_(collector),
       clock_(std::move(clock)),
       session_id_(std::to_string(to_ns(WallClock::now()))) {}
@@ -234,7 +256,6 @@ std::unique_ptr<Connection> FoxgloveClients::connect(Peer& peer) {
 }
 
 void FoxgloveClients::on_state(const VehicleState& state) {
-  host_ = state.host;
   std::set<std::pair<std::string, std::uint64_t>> there;
   for (const StreamInfo& stream : state.streams) {
     const std::string name = stream.id.str();
@@ -253,25 +274,33 @@ void FoxgloveClients::on_state(const VehicleState& state) {
                                 {"schemaName", schema.name},
                                 {"schema", schema.text},
                                 {"schemaEncoding", "ros2msg"}};
-    channels_[id] = {name, stream.incarnation, stream.type, ctl::json_text(advertisement)};
+    channels_[id] = {name, recording::topic_of(stream.id), stream.incarnation, stream.type,
+                     ctl::json_text(advertisement)};
   }
   std::erase_if(channels_, [&](const auto& numbered) {
     return !there.contains({numbered.second.stream, numbered.second.incarnation});
   });
 
-  std::map<std::string, std::pair<Json, Json>> users;  // writers and readers of each topic
+  // Writers and readers of each topic, also of those that have none: a client keeps what it knows
+  // of a topic that is not named.
+  std::map<std::string, std::pair<Json, Json>> users;
+  for (const auto& [id, channel] : channels_) {
+    users[channel.topic] = {Json::array(), Json::array()};
+  }
   for (const NodeInfo& node : state.nodes) {
     const std::string program = fmt::format("{}@{} ({})", node.program, node.host, node.pid);
     for (const NodeStream& used : node.streams) {
-      auto& [writers, readers] = users[recording::topic_of(used.stream)];
+      const auto topic = users.find(recording::topic_of(used.stream));
+      if (topic == users.end()) continue;
+      auto& [writers, readers] = topic->second;
       (used.role == Role::writer ? writers : readers).push_back(program);
     }
   }
   Json published = Json::array(), subscribed = Json::array();
   for (const auto& [topic, programs] : users) {
     const auto& [writers, readers] = programs;
-    if (!writers.empty()) published.push_back({{"name", topic}, {"publisherIds", writers}});
-    if (!readers.empty()) subscribed.push_back({{"name", topic}, {"subscriberIds", readers}});
+    published.push_back({{"name", topic}, {"publisherIds", writers}});
+    subscribed.push_back({{"name", topic}, {"subscriberIds", readers}});
   }
   // A whole graph each time it changes: clients replace what they know of each topic.
   const std::string graph = ctl::json_text({{"op", "connectionGraphUpdate"},

@@ -27,8 +27,10 @@ class FoxgloveConnection;
 // All clients. In the server's thread.
 class FoxgloveClients {
  public:
-  // Both outlive it.
-  FoxgloveClients(Streams& streams, StateCollector& collector, PlaybackClock clock);
+  // `streams` and `collector` outlive it.
+  //   host  this one's name
+  FoxgloveClients(std::string host, Streams& streams, StateCollector& collector,
+                  PlaybackClock clock);
 
   std::unique_ptr<Connection> connect(Peer& peer);
 
@@ -42,16 +44,16 @@ class FoxgloveClients {
  private:
   friend class FoxgloveConnection;
   struct Channel {
-    std::string stream;
+    std::string stream, topic;
     std::uint64_t incarnation = 0;
     TypeInfo type;
     std::string advertisement;  // JSON
   };
 
+  const std::string host_;
   Streams& streams_;
   StateCollector& collector_;
   PlaybackClock clock_;
-  std::string host_;
   std::map<std::uint32_t, Channel> channels_;  // by their ids
   std::uint32_t last_channel_ = 0;
   std::string graph_;  // the message about programs and streams

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // dssm-view: shows the streams of all hosts in a web browser, to Foxglove, and their figures to
-// Prometheus. It is a reader as any other: what it does, or a browser that hangs, delays nobody.
+// Prometheus. It is a reader as any other: what it does, or a browser that hangs, delays no other program.
 //
 // Exit status: 0 ended by a signal, 1 failure, 2 wrong usage.
 #include <fmt/format.h>
@@ -87,7 +87,8 @@ Result<void> serve(Options options) {
   Streams streams(session, server);
   StateCollector collector(session, options.socket_path);
   Pages pages(streams, collector);
-  FoxgloveClients foxglove(streams, collector, std::move(clock));
+  FoxgloveClients foxglove(DSSM_TRY(session.daemon_info()).host, streams, collector,
+                           std::move(clock));
   Worker scrapes;
 
   server.serve_websocket("dssm.view.v1", [&](Peer& peer) { return pages.connect(peer); });
@@ -104,7 +105,7 @@ Result<void> serve(Options options) {
   collector.start([&](const VehicleState& state) {
     server.post([&, state] {
       foxglove.on_state(state);
-      pages.on_state(state.json);
+      pages.on_state(state);
     });
   });
 
@@ -119,6 +120,7 @@ Result<void> serve(Options options) {
                 .c_str());
   std::fflush(stdout);
   server.run();
+  for (const int number : {SIGINT, SIGTERM, SIGHUP}) ::signal(number, SIG_IGN);
   return {};
 }
 
@@ -135,6 +137,8 @@ int main_program(int argc, char** argv) {
       "Shows the streams of all hosts in a web browser and to Foxglove, and their figures to "
       "Prometheus (/metrics).",
       "dssm-view");
+  // What is on the command line comes after the file.
+  app.option_defaults()->multi_option_policy(CLI::MultiOptionPolicy::TakeLast);
   app.set_version_flag("--version", DSSM_VERSION);
   app.add_option("--listen", options.listen, "Where to listen")
       ->type_name("ADDRESS:PORT")
@@ -152,10 +156,12 @@ int main_program(int argc, char** argv) {
   app.add_flag("--insecure", options.insecure,
                "Listen for other PCs without TLS: all who reach the address may read all streams");
   app.add_option("--host", server.hosts, "A further name by which browsers may call this server")
-      ->type_name("NAME");
+      ->type_name("NAME")
+      ->multi_option_policy(CLI::MultiOptionPolicy::Throw);
   app.add_option("--origin", server.origins,
                  "A server whose pages may connect, as https://app.foxglove.dev")
-      ->type_name("URL");
+      ->type_name("URL")
+      ->multi_option_policy(CLI::MultiOptionPolicy::Throw);
   app.add_option("--pages", server.pages, "The folder with the page")->type_name("FOLDER");
   std::string config;
   app.add_option("--config", config,
@@ -175,8 +181,10 @@ int main_program(int argc, char** argv) {
   } catch (const CLI::ParseError& error) {
     return app.exit(error) == 0 ? kSuccess : kWrongUsage;
   }
-  if (server.certificate.empty() != server.key.empty()) {
-    std::fputs("dssm-view: --certificate and --key belong together\n", stderr);
+  if (server.certificate.empty() != server.key.empty() ||
+      (server.certificate.empty() && !server.authority.empty())) {
+    std::fputs("dssm-view: --certificate and --key belong together, and --authority needs both\n",
+               stderr);
     return kWrongUsage;
   }
   const Result<void> served = serve(std::move(options));

@@ -27,6 +27,7 @@ constexpr std::size_t kMaxUnanswered = 16;
 constexpr std::size_t kMaxStreams = 64;  // of one request
 constexpr std::size_t kMaxFields = 64;
 constexpr std::uint64_t kMaxPoints = 20'000;
+constexpr std::uint64_t kMaxAllPoints = 400'000;       // of all fields of one request
 constexpr std::uint64_t kMaxPayloadBytes = 32U << 20;  // of one answer
 constexpr std::size_t kAlignment = 8;                  // of data in an answer
 
@@ -46,7 +47,8 @@ Result<std::optional<Time>> time_of(const Json& request, const char* key) {
   const std::string text = text_of(request, key);
   std::int64_t ns = 0;
   const auto end = text.data() + text.size();
-  if (text.empty() || std::from_chars(text.data(), end, ns).ptr != end) {
+  const auto read = std::from_chars(text.data(), end, ns);
+  if (text.empty() || read.ptr != end || read.ec != std::errc()) {
     return bad_request(fmt::format("'{}' is to be a string of nanoseconds since 1970", key));
   }
   return std::optional(time_from_ns(ns));
@@ -143,6 +145,10 @@ Result<Message> signals_answer(Streams& streams, std::uint32_t id, const Json& r
       points->get<std::uint64_t>() < 2 || points->get<std::uint64_t>() > kMaxPoints) {
     return bad_request(fmt::format("'points' is to be a number from 2 to {}", kMaxPoints));
   }
+  if (names.size() * points->get<std::uint64_t>() > kMaxAllPoints) {
+    return bad_request(
+        fmt::format("'points' times the number of 'fields' is to be at most {}", kMaxAllPoints));
+  }
   DataAnswer answer(id);
   Json head = Json::object();
   const Streams::Found found = streams.find(text_of(request, "stream"));
@@ -176,6 +182,7 @@ Result<Message> signals_answer(Streams& streams, std::uint32_t id, const Json& r
   head["status"] = name_of(range.status);
   head["samples"] = range.samples;
   head["lost"] = range.lost;
+  head["left_out"] = range.left_out;
   head["clock_error_s"] = range.clock_error >= kForeignClockError
                               ? Json()
                               : Json(std::chrono::duration<double>(range.clock_error).count());
@@ -235,6 +242,8 @@ void read_newest(Part& part) {
 Result<Message> at_answer(Streams& streams, std::uint32_t id, const Json& request) {
   const std::vector<std::string> names = DSSM_TRY(texts_of(request, "streams", kMaxStreams));
   const std::optional<Time> t = DSSM_TRY(time_of(request, "t_ns"));
+  const auto payloads = request.find("payloads");
+  const bool has_payloads = payloads == request.end() || *payloads != false;
   std::vector<Part> parts;
   std::uint64_t bytes = 0;
   for (const std::string& name : names) {
@@ -271,7 +280,8 @@ Result<Message> at_answer(Streams& streams, std::uint32_t id, const Json& reques
       json["time_ns"] = time_json(part.info.time);
       json["clock_error_ns"] =
           error >= kForeignClockError ? Json() : Json(std::to_string(to_ns(error)));
-      json["payload_at"] = answer.add(std::span(part.payload).first(part.info.payload_bytes));
+      if (has_payloads)
+        json["payload_at"] = answer.add(std::span(part.payload).first(part.info.payload_bytes));
       json["payload_bytes"] = part.info.payload_bytes;
     }
     head["samples"].push_back(std::move(json));
@@ -325,12 +335,13 @@ class PageConnection : public Connection {
 
   // Answers requests for a state that this page has not had.
   void send_state() {
-    if (waiting_for_state_.empty() || state_number_ == pages_.state_number_) return;
+    if (waiting_for_state_.empty() || pages_.state_.empty() ||
+        state_number_ == pages_.state_number_) {
+      return;
+    }
     state_number_ = pages_.state_number_;
     for (const std::uint32_t id : std::exchange(waiting_for_state_, {})) {
-      Json answer = {{"id", id}};
-      answer.update(pages_.state_);
-      peer_.send(Message::text(ctl::json_text(answer)));
+      peer_.send(Message::text(fmt::format("{{\"id\":{},{}", id, pages_.state_.substr(1))));
     }
   }
 
@@ -345,8 +356,9 @@ std::unique_ptr<Connection> Pages::connect(Peer& peer) {
   return std::make_unique<PageConnection>(*this, peer);
 }
 
-void Pages::on_state(Json state) {
-  state_ = std::move(state);
+void Pages::on_state(const VehicleState& state) {
+  // One without programs and findings is not for pages: their next request asks for all.
+  state_ = state.has_all ? ctl::json_text(state.json) : "";
   ++state_number_;
   for (PageConnection* connection : connections_) connection->send_state();
 }

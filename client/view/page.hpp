@@ -10,7 +10,6 @@
 #include <set>
 #include <string>
 
-#include "client/dssmctl/output.hpp"
 #include "client/view/server.hpp"
 #include "client/view/state.hpp"
 #include "client/view/streams.hpp"
@@ -28,14 +27,14 @@ class Pages {
   std::unique_ptr<Connection> connect(Peer& peer);
 
   // A new state, for the pages that wait for one.
-  void on_state(ctl::Json state);
+  void on_state(const VehicleState& state);
 
  private:
   friend class PageConnection;
   Streams& streams_;
   StateCollector& collector_;
-  ctl::Json state_;
-  std::uint64_t state_number_ = 0;  // 0: there is none yet
+  std::string state_;  // the newest as JSON; empty: there is none with all that pages show
+  std::uint64_t state_number_ = 0;
   std::set<PageConnection*> connections_;
 };
 

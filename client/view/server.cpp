@@ -4,7 +4,9 @@
 #include <arpa/inet.h>
 #include <fmt/format.h>
 #include <libwebsockets.h>
+#include <netinet/in.h>
 #include <openssl/ssl.h>
+#include <sys/socket.h>
 #include <unistd.h>
 
 #include <algorithm>
@@ -22,8 +24,6 @@ namespace {
 constexpr std::size_t kMaxRequestBytes = 64U << 10;  // of a WebSocket's message to this server
 constexpr unsigned kMaxDescriptors = 256;            // of connections and files at once
 constexpr std::size_t kMaxReported = 100;            // different reasons for refusals, each once
-// Browsers ask each time whether a file has changed.
-constexpr int kRevalidate = 1;
 
 // The value of a request's header; empty: it has none.
 std::string header(lws* connection, lws_token_indexes which) {
@@ -50,9 +50,47 @@ bool is_address(const std::string& text) {
          ::inet_pton(AF_INET6, text.c_str(), ignored.data()) == 1;
 }
 
+std::string lower_case(std::string text) {
+  for (char& c : text) {
+    if (c >= 'A' && c <= 'Z') c = static_cast<char>(c - 'A' + 'a');
+  }
+  return text;
+}
+
 std::string this_pc() {
   std::array<char, 256> name{};
-  return ::gethostname(name.data(), name.size() - 1) == 0 ? name.data() : "";
+  return ::gethostname(name.data(), name.size() - 1) == 0 ? lower_case(name.data()) : "";
+}
+
+// Whether this process listens at that port, and at no other address than that: libwebsockets
+// listens at all addresses when it does not find the one that is wanted.
+bool listens_only_at(const std::string& address, int port) {
+  in6_addr wanted_v6{};
+  in_addr wanted_v4{};
+  const bool is_v4 = ::inet_pton(AF_INET, address.c_str(), &wanted_v4) == 1;
+  if (!is_v4) ::inet_pton(AF_INET6, address.c_str(), &wanted_v6);
+  bool is_there = false;
+  for (int fd = 0; fd < static_cast<int>(kMaxDescriptors); ++fd) {
+    int listens = 0;
+    socklen_t bytes = sizeof listens;
+    if (::getsockopt(fd, SOL_SOCKET, SO_ACCEPTCONN, &listens, &bytes) != 0 || listens == 0)
+      continue;
+    sockaddr_storage bound{};
+    bytes = sizeof bound;
+    if (::getsockname(fd, reinterpret_cast<sockaddr*>(&bound), &bytes) != 0) continue;
+    const auto& v4 = reinterpret_cast<const sockaddr_in&>(bound);
+    const auto& v6 = reinterpret_cast<const sockaddr_in6&>(bound);
+    const bool is_it = bound.ss_family == AF_INET ? is_v4 && v4.sin_addr.s_addr == wanted_v4.s_addr
+                                                  : !is_v4 && std::memcmp(&v6.sin6_addr, &wanted_v6,
+                                                                          sizeof wanted_v6) == 0;
+    if ((bound.ss_family == AF_INET ? v4.sin_port : v6.sin6_port) !=
+        htons(static_cast<std::uint16_t>(port))) {
+      continue;
+    }
+    if (!is_it) return false;
+    is_there = true;
+  }
+  return is_there;
 }
 
 }  // namespace
@@ -136,11 +174,25 @@ Server::Server(ServerOptions options)
     : options_(std::move(options)), library_(std::make_unique<Library>()) {}
 
 Server::~Server() {
+  if (context_) end();
+}
+
+// Connections end here, while what they use is there still.
+void Server::end() {
+  {
+    const std::lock_guard lock(mutex_);
+    is_running_ = false;
+  }
   for (const auto& timer : timers_) lws_sul_cancel(&timer->entry);
-  if (context_) lws_context_destroy(context_);
+  lws_context_destroy(std::exchange(context_, nullptr));
 }
 
 Result<std::uint16_t> Server::listen() {
+  if (!is_address(options_.address)) {
+    return Error{Errc::invalid_argument,
+                 fmt::format("listen on '{}': that is not an address, as 127.0.0.1 or [::1]",
+                             options_.address)};
+  }
   lws_set_log_level(LLL_ERR, [](int, const char* line) {
     std::fputs(fmt::format("dssm-view: {}", line).c_str(), stderr);
   });
@@ -152,7 +204,6 @@ Result<std::uint16_t> Server::listen() {
   library.files.origin = library.pages.c_str();
   library.files.origin_protocol = LWSMPRO_FILE;
   library.files.def = "index.html";
-  library.files.cache_revalidate = kRevalidate;
 
   for (const auto& [path, text] : texts_) {
     lws_http_mount mount{};
@@ -194,14 +245,25 @@ Result<std::uint16_t> Server::listen() {
 
   lws_context_creation_info info{};
   info.port = options_.port;
-  info.iface = library.address.c_str();
+  const bool is_any = library.address == "0.0.0.0" || library.address == "::";
+  info.iface = is_any ? nullptr : library.address.c_str();
   info.protocols = library.protocols.data();
   info.mounts = library.texts.empty() ? &library.files : &library.texts.back();
   info.headers = &library.headers.back();
   info.user = this;
   info.options = LWS_SERVER_OPTION_FAIL_UPON_UNABLE_TO_BIND | LWS_SERVER_OPTION_VALIDATE_UTF8;
+  // With IPv6 it does not find addresses of IPv4.
+  if (library.address.find(':') == std::string::npos)
+    info.options |= LWS_SERVER_OPTION_DISABLE_IPV6;
   info.keepalive_timeout = 60;
   info.fd_limit_per_thread = kMaxDescriptors;
+  for (const std::filesystem::path& file :
+       {options_.certificate, options_.key, options_.authority}) {
+    if (!file.empty() && ::access(file.c_str(), R_OK) != 0) {
+      return Error{Errc::system, fmt::format("read '{}': {}", file.string(),
+                                             std::generic_category().message(errno))};
+    }
+  }
   if (!options_.certificate.empty()) {
     library.certificate = options_.certificate.string();
     library.key = options_.key.string();
@@ -224,9 +286,16 @@ Result<std::uint16_t> Server::listen() {
                     "address of this PC?",
                     options_.address, options_.port, std::generic_category().message(errno))};
   }
+  const int port = lws_get_vhost_listen_port(lws_get_vhost_by_name(context_, "default"));
+  if (!listens_only_at(options_.address, port)) {
+    return Error{Errc::system,
+                 fmt::format("listen on {} only: the addresses of this PC's interfaces are not "
+                             "known; may this process use AF_NETLINK?",
+                             options_.address)};
+  }
   for (const auto& timer : timers_) timer->schedule();
-  return static_cast<std::uint16_t>(
-      lws_get_vhost_listen_port(lws_get_vhost_by_name(context_, "default")));
+  is_running_ = true;
+  return static_cast<std::uint16_t>(port);
 }
 
 void Server::serve_text(const std::string& path, std::string content_type,
@@ -243,11 +312,9 @@ void Server::repeat(Duration period, std::function<void()> call) {
 }
 
 void Server::post(std::function<void()> call) {
-  {
-    const std::lock_guard lock(mutex_);
-    posted_.push_back(std::move(call));
-  }
-  if (context_) lws_cancel_service(context_);
+  const std::lock_guard lock(mutex_);
+  posted_.push_back(std::move(call));
+  if (is_running_) lws_cancel_service(context_);
 }
 
 void Server::call_posted() {
@@ -262,6 +329,7 @@ void Server::call_posted() {
 void Server::run() {
   while (!is_stopped_ && lws_service(context_, 0) >= 0) {
   }
+  end();
 }
 
 void Server::stop() noexcept {
@@ -271,10 +339,12 @@ void Server::stop() noexcept {
 
 std::string Server::refusal(lws* connection) const {
   const std::string host = header(connection, WSI_TOKEN_HOST);
-  const std::string name(without_port(host));
-  const std::string own = this_pc();
-  if (!is_address(name) && name != "localhost" && name != own && name != own + ".local" &&
-      std::ranges::find(options_.hosts, name) == options_.hosts.end()) {
+  const std::string name = lower_case(std::string(without_port(host)));
+  const std::string own = this_pc(), short_own = own.substr(0, own.find('.'));
+  if (!is_address(name) && name != "localhost" && name != own && name != short_own &&
+      name != short_own + ".local" &&
+      std::ranges::none_of(options_.hosts,
+                           [&](const std::string& other) { return lower_case(other) == name; })) {
     return fmt::format("this PC is not known as '{}'; --host allows the name", name);
   }
   const std::string origin = header(connection, WSI_TOKEN_ORIGIN);
@@ -326,7 +396,7 @@ bool Server::on_http(lws* connection, int reason, std::uint64_t& request) {
       return begin_text(connection, request, header(connection, WSI_TOKEN_GET_URI));
     case LWS_CALLBACK_HTTP_WRITEABLE: {
       const auto found = requests_.find(request);
-      if (found == requests_.end()) return true;
+      if (found == requests_.end() || !found->second.is_made) return true;
       const bool goes_on = write_text(connection, found->second);
       requests_.erase(found);
       return goes_on;
@@ -348,14 +418,20 @@ bool Server::begin_text(lws* connection, std::uint64_t& request, const std::stri
     return lws_http_transaction_completed(connection) == 0;
   }
   lws_set_timeout(connection, NO_PENDING_TIMEOUT, 0);  // dssmd may need longer than lws waits
+  // One that is being made is for all who wait.
+  const bool is_begun = std::ranges::any_of(requests_, [&](const auto& numbered) {
+    return numbered.second.path == path && !numbered.second.is_made;
+  });
   request = ++last_request_;
-  requests_.emplace(request, Request{connection, text->second.content_type});
-  text->second.make([this, number = request](Result<std::string> made) {
-    post([this, number, made = std::move(made)]() mutable {
-      const auto found = requests_.find(number);
-      if (found == requests_.end()) return;  // the client has gone
-      found->second.text = std::move(made);
-      lws_callback_on_writable(found->second.connection);
+  requests_.emplace(request, Request{connection, path});
+  if (is_begun) return true;
+  text->second.make([this, path](const Result<std::string>& made) {
+    post([this, path, made] {
+      for (auto& [number, waiting] : requests_) {
+        if (waiting.path != path || std::exchange(waiting.is_made, true)) continue;
+        waiting.text = made;
+        lws_callback_on_writable(waiting.connection);
+      }
     });
   });
   return true;
@@ -369,8 +445,8 @@ bool Server::write_text(lws* connection, Request& request) {
   unsigned char* const end = head.data() + head.size() - 1;
   if (lws_add_http_common_headers(
           connection, is_made ? HTTP_STATUS_OK : HTTP_STATUS_SERVICE_UNAVAILABLE,
-          is_made ? request.content_type.c_str() : "text/plain; charset=utf-8", text.size(), &at,
-          end) != 0 ||
+          is_made ? texts_.at(request.path).content_type.c_str() : "text/plain; charset=utf-8",
+          text.size(), &at, end) != 0 ||
       lws_finalize_write_http_header(connection, head.data() + LWS_PRE, &at, end) != 0) {
     return false;
   }

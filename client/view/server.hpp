@@ -6,10 +6,11 @@
 //
 // Any web page that a person has open may send requests to this PC. So a request must call this
 // server by an address or by one of its names (header Host; else a name for which an attacker's DNS
-// server gives this PC's address would do), and what the page of another server sends is refused
-// (header Origin).
+// server gives this PC's address would do), and a WebSocket from the page of another server is
+// refused (header Origin). What else such a page sends, its browser does not let it read.
 #pragma once
 
+#include <atomic>
 #include <cstddef>
 #include <cstdint>
 #include <deque>
@@ -122,7 +123,7 @@ class Server {
   // Calls `call` in the thread of run(), soon. Any thread may call it.
   void post(std::function<void()> call);
 
-  // Serves until stop(), which is async-signal-safe. After listen().
+  // Serves until stop(), which is async-signal-safe; then ends all connections. After listen().
   void run();
   void stop() noexcept;
 
@@ -137,7 +138,8 @@ class Server {
   // A client that waits for a text.
   struct Request {
     lws* connection;
-    std::string content_type;
+    std::string path;
+    bool is_made = false;
     Result<std::string> text = std::string();
   };
 
@@ -151,6 +153,7 @@ class Server {
   // Why a client's request is refused, for people; empty: it is not.
   std::string refusal(lws* connection) const;
   void call_posted();
+  void end();
 
   const ServerOptions options_;
   std::unique_ptr<Library> library_;
@@ -163,7 +166,8 @@ class Server {
   std::vector<std::unique_ptr<Timer>> timers_;
   std::mutex mutex_;
   std::vector<std::function<void()>> posted_;
-  volatile bool is_stopped_ = false;
+  bool is_running_ = false;  // context_ may be woken up
+  std::atomic<bool> is_stopped_{false};
 };
 
 }  // namespace dssm::view

@@ -24,8 +24,10 @@ std::optional<Time> oldest_time(const StreamInfo& stream) {
   const double cycle_s =
       stream.rate_hz > 0 ? 1 / stream.rate_hz : std::chrono::duration<double>(stream.cycle).count();
   const double length_s = static_cast<double>(stream.newest - stream.oldest) * cycle_s;
-  return ctl::saturating_add(stream.newest_time,
-                             -Duration(static_cast<std::int64_t>(length_s * 1e9)));
+  constexpr double kMaxSeconds = 1e9;
+  return ctl::saturating_add(
+      stream.newest_time,
+      -Duration(static_cast<std::int64_t>(std::min(length_s, kMaxSeconds) * 1e9)));
 }
 
 Json streams_json(const std::vector<StreamInfo>& streams, Json& range) {
@@ -81,6 +83,7 @@ void StateCollector::run() {
     lock.unlock();
     const MonoTime next = deadline_in(kPeriod);
     const Result<void> collected = collect(all);
+    state_.has_all = all;
     if (bool(collected) != is_connected_) {
       is_connected_ = bool(collected);
       add_event(!is_connected_, is_connected_ ? "dssmd answers again" : collected.error().message);
@@ -106,7 +109,10 @@ Result<void> StateCollector::collect(bool all) {
   json["recording"] = Json();
   json["streams"] = streams_json(state_.streams, json["range"]);
   json["hosts"] = Json::array();
-  for (const HostInfo& host : hosts) json["hosts"].push_back(ctl::host_json(host));
+  for (const HostInfo& host : hosts) {
+    // Another address of a host that is there already.
+    if (host.reason != HostReason::spare_address) json["hosts"].push_back(ctl::host_json(host));
+  }
   if (!all) return {};
   state_.nodes = DSSM_TRY(session_.list_nodes());
   json["nodes"] = Json::array();

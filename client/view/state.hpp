@@ -2,7 +2,7 @@
 //
 // The state of the vehicle, as dssmd knows it, collected once a second by a thread of its own:
 // hosts and streams always, because from their changes follow the events; programs and doctor's
-// findings only while somebody looks.
+// findings only while clients ask for them.
 #pragma once
 
 #include <condition_variable>
@@ -30,6 +30,7 @@ struct VehicleState {
   std::string host;
   std::vector<StreamInfo> streams;
   std::vector<NodeInfo> nodes;
+  bool has_all = false;  // also programs and findings are of now
   ctl::Json json;  // an answer to "overview" of the page's protocol (docs/view.md), without its id
 };
 
@@ -44,7 +45,7 @@ class StateCollector {
   // From now on the thread calls `on_state` with each state. Once.
   void start(std::function<void(const VehicleState&)> on_state);
 
-  // Somebody looks: all is collected, now if it was not for more than a second. Any thread.
+  // A client asks: all is collected, now if it was not for more than a second. Any thread.
   void want_all();
 
  private:

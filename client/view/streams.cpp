@@ -9,18 +9,17 @@
 namespace dssm::view {
 
 OpenStream::OpenStream(RawReader opened)
-    : reader(std::move(opened)),
-      fields(ctl::readable_fields_untrusted(reader.type())),
-      restarts(reader.restarts()) {}
+    : reader(std::move(opened)), fields(ctl::readable_fields_untrusted(reader.type())) {}
 
-void OpenStream::follow_restart() {
-  fields = ctl::readable_fields_untrusted(reader.type());
-  restarts = reader.restarts();
-}
+void OpenStream::follow_restart() { fields = ctl::readable_fields_untrusted(reader.type()); }
 
 Streams::Found Streams::find(const std::string& name) {
-  if (!entries_.contains(name) && entries_.size() >= kMaxStreams) {
-    return {nullptr, "too many streams are open here; try again in half a minute"};
+  if (!entries_.contains(name)) {
+    const Result<StreamId> id = StreamId::parse(name);
+    if (!id) return {nullptr, id.error().message};
+    if (entries_.size() >= kMaxStreams) {
+      return {nullptr, "too many streams are open here; try again in half a minute"};
+    }
   }
   Entry& entry = entries_[name];
   const MonoTime now = MonoClock::now();
@@ -40,8 +39,7 @@ void Streams::open(const std::string& name) {
   entry.retry_at = deadline_in(kRetryPeriod);
   const auto result = std::make_shared<Result<RawReader>>(Error{Errc::unavailable, {}});
   worker_.add([this, name, result] {
-    const Result<StreamId> id = StreamId::parse(name);
-    *result = id ? session_.open_raw_reader(*id) : Result<RawReader>(id.error());
+    *result = session_.open_raw_reader(*StreamId::parse(name));  // find() has tried that
     server_.post([this, name, result] {
       Entry& opened = entries_[name];
       opened.is_opening = false;

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The streams that browsers look at: each is open once, however many look at it, and closed when
-// none did for half a minute. All calls come from the server's thread; opening, which may wait for
+// The streams that clients ask for: each is open once for all clients, and closed when none asked
+// for it for half a minute. All calls come from the server's thread; opening, which may wait for
 // dssmd or for another host, is done by a worker.
 #pragma once
 
@@ -26,7 +26,6 @@ struct OpenStream {
 
   RawReader reader;
   std::vector<Field> fields;  // readable ones; empty: its payload is not described
-  std::uint64_t restarts = 0;
 };
 
 class Streams {

@@ -11,6 +11,7 @@ const kProtocol = "dssm.view.v1";
 const kRetryMs = 1000;
 const kConnectMs = 5000; // a host that was switched off does not refuse the connection
 const kAnswerMs = 20000; // dssm-view ended without closing the connection
+const kMaxUnderWay = 8;
 const kHeadAt = 8; // bytes before the head of a binary answer: id, length of the head
 
 // The connection was lost before the answer came.
@@ -48,12 +49,19 @@ export class Connection extends EventTarget {
     this.state = "connecting";
     this.nextId = 1;
     this.waiting = new Map(); // id -> {resolve, reject, timer}
+    this.queue = []; // requests that are to be sent later: [{request, reject}]
     this.connect();
   }
 
   // Resolves to the JSON answer, or to a BinaryAnswer.
   request(op, parameters = {}) {
     if (this.state !== "connected") return Promise.reject(new LostError("not connected"));
+    // The server ends a connection with too many unanswered requests.
+    if (this.waiting.size >= kMaxUnderWay) {
+      return new Promise((resolve, reject) => {
+        this.queue.push({ request: () => this.request(op, parameters).then(resolve, reject), reject });
+      });
+    }
     const id = this.nextId;
     this.nextId = (this.nextId % 0x7fffffff) + 1;
     const socket = this.socket;
@@ -86,6 +94,7 @@ export class Connection extends EventTarget {
     if (!waiting) return;
     this.waiting.delete(answer.id);
     clearTimeout(waiting.timer);
+    this.queue.shift()?.request();
     // An overview has an error, too: the one of dssmd.
     const failed = typeof data === "string" && answer.error && !("streams" in answer);
     if (failed) waiting.reject(new RequestError(answer.error));
@@ -97,8 +106,9 @@ export class Connection extends EventTarget {
     this.socket = null;
     socket.onopen = socket.onmessage = socket.onclose = null;
     socket.close();
-    const waiting = [...this.waiting.values()];
+    const waiting = [...this.waiting.values(), ...this.queue];
     this.waiting.clear();
+    this.queue = [];
     this.change("lost");
     for (const { reject, timer } of waiting) {
       clearTimeout(timer);

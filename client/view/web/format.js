@@ -26,6 +26,7 @@ export function setText(node, text) {
 // key is there: what a person selected or put in focus in it remains.
 export function syncChildren(parent, items, keyOf, make, update) {
   const old = new Map([...parent.children].map((child) => [child.dataset.key, child]));
+  const used = new Set();
   let place = parent.firstElementChild;
   for (const item of items) {
     const key = keyOf(item);
@@ -36,11 +37,12 @@ export function syncChildren(parent, items, keyOf, make, update) {
       child = make(item);
       child.dataset.key = key;
     }
+    used.add(child);
     update(child, item);
     if (child === place) place = place.nextElementSibling;
     else parent.insertBefore(child, place);
   }
-  for (const child of old.values()) child.remove();
+  for (const child of [...parent.children]) if (!used.has(child)) child.remove();
 }
 
 export function duration(ns) {

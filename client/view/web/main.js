@@ -266,7 +266,7 @@ async function neighbour(stream, t, direction) {
   let ahead = cycle > 0 ? BigInt(cycle) : 10000000n;
   let next = null;
   for (let i = 0; i < kMaxSteps && !next; ++i, ahead *= 2n) {
-    if (time.range && here.ns + ahead > time.range.newest + ahead) break;
+    if (time.range && here.ns > time.range.newest) break;
     const sample = await at(here.ns + ahead);
     if (!sample) return null;
     if (sample.tid !== here.tid) next = sample;

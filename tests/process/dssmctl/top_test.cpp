@@ -164,6 +164,7 @@ class TopOnATerminal : public FleetTest {
     const winsize size{.ws_row = 24, .ws_col = 80, .ws_xpixel = 0, .ws_ypixel = 0};
     pid_ = ::forkpty(&terminal_, nullptr, nullptr, &size);
     if (pid_ == 0) {
+      ::signal(SIGHUP, SIG_DFL);  // under nohup(1) it is ignored
       ::putenv(socket.data());
       ::setenv("LC_ALL", locale.c_str(), 1);
       ::setenv("TZ", "UTC", 1);

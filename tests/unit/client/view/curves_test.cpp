@@ -58,6 +58,17 @@ TEST(CurveBuilder, BreaksWhereSamplesAreMissing) {
   EXPECT_EQ(curve.values[5], 7);
 }
 
+TEST(CurveBuilder, BreaksInTheMidstOfASlice) {
+  CurveBuilder builder(10s, 1);
+  builder.add(1s, 1, 1, false);
+  builder.add(2s, 2, kNotANumber, false);
+  builder.add(3s, 3, 3, false);
+  builder.add(4s, 4, 4, false);
+  const Curve curve = builder.take();
+  ASSERT_EQ(curve.tids, (std::vector<double>{1, 2, 3, 4}));
+  EXPECT_TRUE(std::isnan(curve.values[1]));
+}
+
 // A recording that is played again: plots need rising times.
 TEST(CurveBuilder, LeavesOutTimesThatRunBackwards) {
   CurveBuilder builder(10s, 1000);
