@@ -28,9 +28,14 @@ std::int64_t as_int64(py::handle value, const char* what) {
                        std::string(py::str(py::type::handle_of(value).attr("__name__"))));
 }
 
-// A numpy.datetime64 or timedelta64, as ns; numpy raises an error for one that does not fit.
+// A numpy.datetime64 or timedelta64, as ns. numpy converts one that does not fit to a wrong one.
 std::int64_t numpy_ns(py::handle value, const char* name, const char* unit) {
   const py::object ns = value.attr("astype")(unit);
+  if (!ns.attr("astype")(value.attr("dtype")).equal(value) &&
+      !py::module_::import("numpy").attr("isnat")(value).cast<bool>()) {
+    throw py::value_error(std::string(name) +
+                          " does not fit into 64 bits of nanoseconds, or is finer than these");
+  }
   if (py::module_::import("numpy").attr("isnat")(ns).cast<bool>()) {
     throw py::value_error(std::string(name) + " is NaT (not a time)");
   }

@@ -328,7 +328,10 @@ class FastReads {
     return guarded([&] { return reader_of(self).reads.newest(); });
   }
   static PyObject* tid(PyObject* self, PyObject* tid) {
-    return guarded([&] { return reader_of(self).reads.tid(py::handle(tid).cast<Tid>()); });
+    return guarded([&] {
+      if (!PyIndex_Check(tid)) throw py::type_error("tid() takes a whole number");
+      return reader_of(self).reads.tid(py::handle(tid).cast<Tid>());
+    });
   }
   static PyObject* at(PyObject* self, PyObject* const* given, Py_ssize_t count,
                       PyObject* keywords) {

@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // dssm-view: shows the streams of all hosts in a web browser, to Foxglove, and their figures to
-// Prometheus. It is a reader as any other: what it does, or a browser that hangs, delays no other program.
+// Prometheus. It is a reader as any other: what it does, or a browser that hangs, delays no other
+// program.
 //
 // Exit status: 0 ended by a signal, 1 failure, 2 wrong usage.
 #include <fmt/format.h>

@@ -106,7 +106,6 @@ Result<void> StateCollector::collect(bool all) {
   Json& json = state_.json;
   json["host"] = daemon.host;
   json["version"] = daemon.version;
-  json["recording"] = Json();
   json["streams"] = streams_json(state_.streams, json["range"]);
   json["hosts"] = Json::array();
   for (const HostInfo& host : hosts) {

@@ -12,7 +12,7 @@ numpy.datetime64. Durations are float seconds, a datetime.timedelta or a numpy.t
 
 Reads copy. They return a Sample, or None while there is no such sample yet; each other result is an
 exception of ReadError. A reader or writer belongs to one thread at a time: another one gets InUse.
-Calls that can wait release the interpreter's lock, and Ctrl-C interrupts them.
+Calls that can wait release the interpreter's lock, and Ctrl-C interrupts waits for samples.
 """
 
 from collections.abc import Sequence

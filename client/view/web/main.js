@@ -143,12 +143,11 @@ const overviewPump = new Pump(connection, kOverviewMs, async () => {
     oldest: BigInt(overview.range.oldest_ns),
     newest: BigInt(overview.range.newest_ns),
   };
-  time.setRange(range, overview.recording !== null);
+  time.setRange(range);
   types.forgetRecreated();
-  const name = overview.recording?.file ?? overview.host;
-  setText(find("host"), name);
+  setText(find("host"), overview.host);
   find("host").title = `dssm-view ${overview.version}`;
-  document.title = `${name} \u2013 DSSM view`;
+  document.title = `${overview.host} \u2013 DSSM view`;
   overviewPage.show(overview);
   views.showStreams();
   if (page() && (first || !page().suggested)) page().open();
@@ -160,7 +159,6 @@ const overviewPump = new Pump(connection, kOverviewMs, async () => {
 function complete(answer) {
   for (const list of ["hosts", "streams", "nodes", "findings", "events"]) answer[list] ??= [];
   answer.range ??= null;
-  answer.recording ??= null;
   return answer;
 }
 

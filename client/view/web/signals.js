@@ -430,7 +430,7 @@ export class Signals extends EventTarget {
     for (const panel of this.panels) this.draw(panel);
     this.drawCursor();
     if (opening) return kOpeningMs;
-    return live && this.panels.length > 0 ? 0 : this.time.mode === "play" ? 0 : null;
+    return live && this.panels.length > 0 ? 0 : null;
   }
 
   async askStream(stream, type, live, points) {

@@ -5,12 +5,10 @@
 //
 //   live   the newest samples
 //   hold   the samples at `t`
-//   play   as hold, and `t` moves on (recordings only)
 //
 // While the pointer is over a plot, the instant below it is shown instead (`hover`).
 import { setText, timeOfDay, day, duration } from "./format.js";
 
-const kSpeeds = [0.1, 0.25, 0.5, 1, 2, 5, 10, 20];
 const kShownPlaces = 3;
 
 // Dispatches "change" when the instant to show has changed, and "mode" when the mode has.
@@ -22,8 +20,6 @@ export class Time extends EventTarget {
     this.hover = null;
     this.shown = null; // of the newest answer
     this.range = null; // {oldest, newest}
-    this.recording = false;
-    this.speed = 1;
   }
 
   // The instant to ask for; null: the newest.
@@ -31,19 +27,13 @@ export class Time extends EventTarget {
     return this.hover ?? this.t;
   }
 
-  // What the rings hold, or the recording.
-  setRange(range, recording) {
+  // What the rings hold.
+  setRange(range) {
     this.range = range;
-    if (recording && !this.recording) {
-      this.recording = true;
-      if (this.t === null && range) this.hold(range.oldest);
-      else this.dispatchEvent(new Event("mode"));
-    }
     this.dispatchEvent(new Event("range"));
   }
 
   live() {
-    if (this.recording) return this.hold(this.range?.newest ?? this.t);
     this.set("live", null);
   }
 
@@ -52,28 +42,8 @@ export class Time extends EventTarget {
     if (t !== null) this.set("hold", t);
   }
 
-  play() {
-    if (!this.recording || !this.range) return;
-    if (this.t === null || this.t >= this.range.newest) this.t = this.range.oldest;
-    this.set("play", this.t);
-    let before = performance.now();
-    const step = (at) => {
-      if (this.mode !== "play") return;
-      const passed = Math.max(0, at - before);
-      before = at;
-      const t = this.t + BigInt(Math.round(passed * 1e6 * this.speed));
-      if (t >= this.range.newest) return this.hold(this.range.newest);
-      this.t = t;
-      this.dispatchEvent(new Event("change"));
-      requestAnimationFrame(step);
-    };
-    requestAnimationFrame(step);
-  }
-
   toggle() {
-    if (this.mode === "play") this.hold(this.t);
-    else if (this.recording) this.play();
-    else if (this.mode === "live") this.hold();
+    if (this.mode === "live") this.hold();
     else this.live();
   }
 
@@ -107,18 +77,10 @@ export class TimeBar {
     this.slider = find("slider");
     this.live = find("live");
     this.hold = find("hold");
-    this.play = find("play");
-    this.speed = find("speed");
-    this.speedLabel = find("speed-label");
     this.oldest = find("oldest");
     this.shown = find("shown-t");
-    for (const speed of kSpeeds) {
-      this.speed.add(new Option(`\u00d7${speed}`, speed, speed === 1, speed === 1));
-    }
     this.live.addEventListener("click", () => time.live());
     this.hold.addEventListener("click", () => time.hold());
-    this.play.addEventListener("click", () => time.toggle());
-    this.speed.addEventListener("change", () => (time.speed = Number(this.speed.value)));
     find("step-back").addEventListener("click", () => step(-1));
     find("step-forward").addEventListener("click", () => step(1));
     this.slider.addEventListener("input", () => {
@@ -136,19 +98,14 @@ export class TimeBar {
     const { time } = this;
     this.root.dataset.mode = time.mode;
     this.root.dataset.tNs = time.t ?? "";
-    this.live.hidden = this.hold.hidden = time.recording;
-    this.play.hidden = this.speedLabel.hidden = !time.recording;
     this.live.setAttribute("aria-pressed", String(time.mode === "live"));
     this.hold.setAttribute("aria-pressed", String(time.mode === "hold"));
-    this.play.setAttribute("aria-pressed", String(time.mode === "play"));
-    setText(this.play, time.mode === "play" ? "Pause" : "Play");
     this.slider.disabled = !time.range;
     if (time.range) this.updateSlider();
     const shown = time.shown;
     if (shown === null) return;
     this.shown.dataset.tNs = String(shown);
-    const reference = time.recording ? time.range?.oldest : time.range?.newest;
-    const distance = reference === undefined ? 0n : shown - reference;
+    const distance = time.range ? shown - time.range.newest : 0n;
     const sign = distance < 0n ? "\u2212" : "+";
     const seconds = `${sign}${(Math.abs(Number(distance)) / 1e9).toFixed(3)} s`;
     const text = timeOfDay(shown, kShownPlaces);
@@ -165,9 +122,7 @@ export class TimeBar {
     this.slider.value = String(t - oldest);
     this.slider.setAttribute("aria-valuetext", timeOfDay(t));
     const length = duration(end - oldest);
-    setText(this.oldest, this.time.recording ? length : `\u2212${length}`);
-    this.oldest.title = this.time.recording
-      ? "The length of the recording"
-      : `The rings hold samples from ${timeOfDay(oldest)} to ${timeOfDay(newest)}`;
+    setText(this.oldest, `\u2212${length}`);
+    this.oldest.title = `The rings hold samples from ${timeOfDay(oldest)} to ${timeOfDay(newest)}`;
   }
 }

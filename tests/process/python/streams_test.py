@@ -359,7 +359,7 @@ class Reads(Case):
         for time_ in (1.5, True, "now", None, datetime.datetime.now()):
             with self.subTest(time=time_), self.assertRaises(TypeError):
                 self.reader.at(time_)
-        for time_ in (1 << 63, np.datetime64("NaT")):
+        for time_ in (1 << 63, np.datetime64("NaT"), np.datetime64("3000-01-01")):
             with self.subTest(time=time_), self.assertRaises(ValueError):
                 self.reader.at(time_)
         for age in (-1, float("nan")):
@@ -367,6 +367,8 @@ class Reads(Case):
                 self.reader.at(T0, age)
         with self.assertRaises(TypeError):
             self.reader.at(T0, "1 s")
+        with self.assertRaises(TypeError):
+            self.reader.tid("x")
 
     def test_copies_do_not_change(self):
         self.fill(1)

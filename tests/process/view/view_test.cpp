@@ -158,7 +158,6 @@ TEST_F(View, ShowsHostsStreamsAndPrograms) {
   });
   EXPECT_EQ(overview["host"], "pc1");
   EXPECT_EQ(overview["error"], "");
-  EXPECT_EQ(overview["recording"], nullptr);
   EXPECT_EQ(overview["hosts"].size(), 3U);
   EXPECT_EQ(overview["streams"][0]["stream"], "motion:0@pc1");
   EXPECT_EQ(overview["streams"][0]["writers"], 1);
