@@ -84,6 +84,10 @@ Result<void> serve(Options options) {
   Session session = DSSM_TRY(Session::connect(session_options));
   PlaybackClock clock = DSSM_TRY(session.open_playback_clock());
 
+  // Signals are for this thread: the others must not stop a server that may have ended.
+  sigset_t all, before;
+  ::sigfillset(&all);
+  ::pthread_sigmask(SIG_SETMASK, &all, &before);
   Server server(options.server);
   Streams streams(session, server);
   StateCollector collector(session, options.socket_path);
@@ -114,6 +118,7 @@ Result<void> serve(Options options) {
   struct sigaction action {};
   action.sa_handler = on_stop_signal;
   for (const int number : {SIGINT, SIGTERM, SIGHUP}) ::sigaction(number, &action, nullptr);
+  ::pthread_sigmask(SIG_SETMASK, &before, nullptr);
   const std::string& address = options.server.address;
   const std::string host = address.find(':') == std::string::npos ? address : "[" + address + "]";
   std::puts(fmt::format("dssm-view: http{}://{}:{}/", options.server.certificate.empty() ? "" : "s",
@@ -121,7 +126,6 @@ Result<void> serve(Options options) {
                 .c_str());
   std::fflush(stdout);
   server.run();
-  for (const int number : {SIGINT, SIGTERM, SIGHUP}) ::signal(number, SIG_IGN);
   return {};
 }
 

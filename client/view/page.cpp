@@ -6,7 +6,6 @@
 #include <algorithm>
 #include <array>
 #include <charconv>
-#include <cstring>
 #include <limits>
 #include <optional>
 #include <utility>
@@ -78,11 +77,14 @@ class DataAnswer {
  public:
   explicit DataAnswer(std::uint32_t id) : id_(id) {}
 
-  // Where the data will be; they are sent with send() and must live until then.
+  // Where the data will be; they must live until message().
   std::uint64_t add(std::span<const std::byte> data) {
+    static constexpr std::array<std::byte, kAlignment> kPadding{};
     const std::uint64_t at = bytes_;
+    const std::size_t padding = (kAlignment - data.size() % kAlignment) % kAlignment;
     parts_.push_back(data);
-    bytes_ = (at + data.size() + kAlignment - 1) / kAlignment * kAlignment;
+    parts_.push_back(std::span(kPadding).first(padding));
+    bytes_ += data.size() + padding;
     return at;
   }
 
@@ -90,14 +92,10 @@ class DataAnswer {
     std::string text = ctl::json_text(head);
     text.resize((text.size() + kAlignment - 1) / kAlignment * kAlignment, ' ');
     const std::array<std::uint32_t, 2> lengths = {id_, static_cast<std::uint32_t>(text.size())};
-    std::vector<std::byte> data(bytes_);
-    std::size_t at = 0;
-    for (const auto part : parts_) {
-      if (!part.empty()) std::memcpy(data.data() + at, part.data(), part.size());
-      at += (part.size() + kAlignment - 1) / kAlignment * kAlignment;
-    }
-    return Message::binary(
-        {std::as_bytes(std::span(lengths)), std::as_bytes(std::span(text)), data});
+    std::vector<std::span<const std::byte>> all = {std::as_bytes(std::span(lengths)),
+                                                   std::as_bytes(std::span(text))};
+    all.insert(all.end(), parts_.begin(), parts_.end());
+    return Message::binary(all);
   }
 
  private:

@@ -106,7 +106,7 @@ Message Message::text(std::string_view text) {
   return message;
 }
 
-Message Message::binary(std::initializer_list<std::span<const std::byte>> parts) {
+Message Message::binary(const std::vector<std::span<const std::byte>>& parts) {
   std::size_t bytes = 0;
   for (const auto part : parts) bytes += part.size();
   Message message(bytes, false);
@@ -333,8 +333,7 @@ void Server::run() {
 }
 
 void Server::stop() noexcept {
-  is_stopped_ = true;
-  lws_cancel_service(context_);
+  if (!is_stopped_.exchange(true)) lws_cancel_service(context_);  // a second time it may be gone
 }
 
 std::string Server::refusal(lws* connection) const {

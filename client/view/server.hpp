@@ -18,7 +18,6 @@
 #include <dssm/time.hpp>
 #include <filesystem>
 #include <functional>
-#include <initializer_list>
 #include <map>
 #include <memory>
 #include <mutex>
@@ -38,7 +37,7 @@ class Message {
  public:
   static Message text(std::string_view text);
   // All `parts`, one after the other.
-  static Message binary(std::initializer_list<std::span<const std::byte>> parts);
+  static Message binary(const std::vector<std::span<const std::byte>>& parts);
 
   std::size_t bytes() const;
 

@@ -24,11 +24,12 @@ Streams::Found Streams::find(const std::string& name) {
   Entry& entry = entries_[name];
   const MonoTime now = MonoClock::now();
   entry.used = now;
-  if (entry.stream && entry.stream->reader.restart_error()) {  // it cannot go on
-    entry.error = entry.stream->reader.restart_error()->message;
+  if (entry.stream) {
+    const std::optional<Error> error = entry.stream->reader.restart_error();
+    if (!error) return {&*entry.stream, {}};
+    entry.error = error->message;  // it cannot go on
     entry.stream.reset();
   }
-  if (entry.stream) return {&*entry.stream, {}};
   if (!entry.is_opening && now >= entry.retry_at) open(name);
   return {nullptr, entry.error};
 }

@@ -80,8 +80,8 @@ std::string make_temp_dir() {
 
 void remove_tree(const std::string& path) { std::filesystem::remove_all(path); }
 
-std::uint16_t free_udp_port() {
-  const int socket = ::socket(AF_INET, SOCK_DGRAM | SOCK_CLOEXEC, 0);
+std::uint16_t free_port(int socket_type) {
+  const int socket = ::socket(AF_INET, socket_type | SOCK_CLOEXEC, 0);
   sockaddr_in address{};
   address.sin_family = AF_INET;
   address.sin_addr.s_addr = htonl(INADDR_LOOPBACK);

@@ -34,8 +34,8 @@ pid_t start(const std::vector<std::string>& argv, const std::vector<std::string>
             int out_fd = -1);
 int wait_for(pid_t pid);
 
-// A UDP port of loopback that is free at this moment.
-std::uint16_t free_udp_port();
+// A port of loopback that is free at this moment, for SOCK_DGRAM or SOCK_STREAM.
+std::uint16_t free_port(int socket_type);
 
 // For a child of a test that runs as root: makes it the user nobody, in these groups only; ends it
 // with status 100 when that fails.

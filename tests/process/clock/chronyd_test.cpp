@@ -5,6 +5,7 @@
 #include <event2/event.h>
 #include <gtest/gtest.h>
 #include <signal.h>
+#include <sys/socket.h>
 #include <unistd.h>
 
 #include <algorithm>
@@ -99,7 +100,7 @@ class Chronyd {
 
  private:
   const std::string dir_;
-  const std::uint16_t port_ = test::free_udp_port();
+  const std::uint16_t port_ = test::free_port(SOCK_DGRAM);
   pid_t pid_ = -1;
 };
 
@@ -164,7 +165,7 @@ void expect_printed(Duration ours, double a, double b) {
 }
 
 TEST_F(ChronydTest, ReportsWhatChronycPrints) {
-  const std::uint16_t ntp_port = test::free_udp_port();
+  const std::uint16_t ntp_port = test::free_port(SOCK_DGRAM);
   const Chronyd reference("local stratum 10\nallow 127.0.0.1\nbindaddress 127.0.0.1\nport " +
                           std::to_string(ntp_port) + "\n");
   const Chronyd chronyd("server 127.0.0.1 port " + std::to_string(ntp_port) +

@@ -3,6 +3,7 @@
 // dssmctl record --black-box, as the service runs it: each of its triggers, the files of incidents,
 // and what limits them.
 #include <signal.h>
+#include <sys/socket.h>
 #include <unistd.h>
 
 #include <algorithm>
@@ -238,7 +239,7 @@ class BlackBoxWithClock : public testing::Test {
 TEST_F(BlackBoxWithClock, IsTriggeredByAClockOutOfBounds) {
   TestFolder folder;
   std::filesystem::permissions(folder.path(), std::filesystem::perms::owner_all);
-  const std::string port = std::to_string(free_udp_port());
+  const std::string port = std::to_string(free_port(SOCK_DGRAM));
   std::ofstream(folder.file("chrony.conf"))
       << "bindcmdaddress 127.0.0.1\nport 0\nlocal stratum 1\ncmdport " << port << "\npidfile "
       << folder.file("chronyd.pid") << "\n";

@@ -2,11 +2,8 @@
 //
 // dssm-view as other tools meet it: Foxglove's own client (foxglove/client.cjs), and a real
 // Prometheus.
-#include <netinet/in.h>
 #include <sys/socket.h>
-#include <unistd.h>
 
-#include <cstdlib>
 #include <filesystem>
 #include <fstream>
 #include <regex>
@@ -18,21 +15,6 @@ namespace dssm::test {
 namespace {
 
 using ViewTools = ViewTest;
-
-// Of 127.0.0.1, at this moment.
-std::uint16_t free_tcp_port() {
-  const int fd = ::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0);
-  sockaddr_in address{};
-  address.sin_family = AF_INET;
-  address.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
-  socklen_t bytes = sizeof address;
-  if (::bind(fd, reinterpret_cast<sockaddr*>(&address), bytes) != 0 ||
-      ::getsockname(fd, reinterpret_cast<sockaddr*>(&address), &bytes) != 0) {
-    std::abort();
-  }
-  ::close(fd);
-  return ntohs(address.sin_port);
-}
 
 // --- Foxglove
 
@@ -108,7 +90,7 @@ TEST_F(ViewTools, LetPrometheusRaiseAnAlert) {
     if (!contains(line, " for: ")) rules << line << "\n";  // at once
   }
   rules.close();
-  const std::uint16_t port = free_tcp_port();
+  const std::uint16_t port = free_port(SOCK_STREAM);
   const std::string at = "127.0.0.1:" + std::to_string(port);
   Running prometheus({"prometheus", "--config.file=" + folder.file("prometheus.yml"),
                       "--storage.tsdb.path=" + folder.file("data"), "--web.listen-address=" + at},
