@@ -220,7 +220,7 @@ TEST_F(FrameConnectionTest, HandsNothingOutWhilePaused) {
     return {};
   };
   Bytes three;
-  for (const std::uint64_t serial : {1, 2, 3}) {
+  for (const std::uint64_t serial : {1U, 2U, 3U}) {
     const Bytes one = to_bytes(ping(serial));
     three.insert(three.end(), one.begin(), one.end());
   }

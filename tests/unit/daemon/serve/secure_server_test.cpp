@@ -49,7 +49,8 @@ class SecureServer : public testing::Test {
 
   std::string folder(const std::string& name) const { return dir / name; }
   std::shared_ptr<wire::OwnCredentials> load(const std::string& name) {
-    return std::make_shared<wire::OwnCredentials>(wire::TlsCredentials::load(folder(name)).value());
+    return std::make_shared<wire::OwnCredentials>(
+        wire::OwnCredentials{wire::TlsCredentials::load(folder(name)).value()});
   }
   std::shared_ptr<wire::OwnCredentials> issue(const Authority::Subject& subject) {
     serials[subject.name] = authority.issue(subject, folder(subject.name));
@@ -83,7 +84,7 @@ class SecureServer : public testing::Test {
                     }};
   Registry registry{"pc1", kLimits};
   OpenTable opens{{100, 100}};
-  const Rights rights;
+  const Rights rights{};
   LogRecorder logger;
   std::shared_ptr<wire::OwnCredentials> own = issue(Authority::host("pc1"));
   ChannelServer server{
