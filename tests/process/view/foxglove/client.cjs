@@ -57,7 +57,8 @@ client.on("message", ({ subscriptionId, timestamp, data }) => {
 client.on("time", () => done("time"));
 client.on("connectionGraphUpdate", (update) => {
   const writers = new Map(update.publishedTopics.map((topic) => [topic.name, topic.publisherIds]));
-  if (!topics.every((topic) => writers.has(topic)) || !missing.has("graph")) return;
+  // The first graph may come before the programs are known.
+  if (!topics.every((topic) => writers.get(topic)?.length > 0) || !missing.has("graph")) return;
   for (const topic of topics) console.log("writers", topic, writers.get(topic).join(" "));
   done("graph");
 });
