@@ -24,10 +24,6 @@ namespace {
 
 constexpr Duration kReadingPeriod = std::chrono::seconds(1);  // as often as hosts send their clocks
 
-bool is_there(const HostInfo& host) {
-  return host.state == HostState::self || host.state == HostState::up;
-}
-
 std::string reference_text(const HostInfo& host) {
   if (host.clock->basis == ClockBasis::own) return "itself";
   return or_dash(escaped(host.clock_reference));
@@ -95,7 +91,7 @@ void print_clocks(const std::vector<HostInfo>& hosts, const ClockOptions& option
   if (options.json) {
     Json all = Json::array();
     for (const HostInfo& host : hosts) {
-      if (is_there(host)) all.push_back(clock_json(host));
+      if (is_up(host.state)) all.push_back(clock_json(host));
     }
     return out.add(json_output({{"clocks", std::move(all)}}, options.watch));
   }
@@ -110,7 +106,7 @@ void print_clocks(const std::vector<HostInfo>& hosts, const ClockOptions& option
                {"READS"},
                {"REASON", Table::Align::left, 0, Table::Column::Fit::below}});
   for (const HostInfo& host : hosts) {
-    if (is_there(host)) table.add_row(clock_row(host));
+    if (is_up(host.state)) table.add_row(clock_row(host));
   }
   table.print(out);
 }
@@ -245,7 +241,7 @@ Result<void> tabulate_clocks(Session& session, const ClockOptions& options, Outp
     if (!out.sleep_until(next)) break;
     const std::vector<HostInfo> hosts = DSSM_TRY(session.list_hosts());
     for (const HostInfo& host : hosts) {
-      if (!is_there(host)) continue;
+      if (!is_up(host.state)) continue;
       Readings& readings = all.try_emplace(host.name, count).first->second;
       if (!host.clock || host.clock_bound() == kUnknownClockError) {
         ++readings.unknown;

@@ -16,10 +16,6 @@ Json round_trip_json(Duration round_trip) {
   return round_trip > Duration::zero() ? Json(to_ns(round_trip)) : Json();
 }
 
-bool is_connected(const HostInfo& host) {
-  return host.state == HostState::self || host.state == HostState::up;
-}
-
 std::string note(const HostInfo& host) {
   std::string text = host.insecure ? "insecure: nothing is encrypted" : "";
   const auto add = [&](const std::string& more) { text += (text.empty() ? "" : "; ") + more; };
@@ -51,6 +47,8 @@ Json mirror_json(const MirrorInfo& mirror) {
           {"error", or_null(mirror.error)}};
 }
 
+bool is_up(HostState state) { return state == HostState::self || state == HostState::up; }
+
 bool is_good(const ClockSnapshot& clock) {
   return clock.status == ClockStatus::synchronized || clock.status == ClockStatus::holdover;
 }
@@ -73,7 +71,7 @@ Json host_json(const HostInfo& host) {
   json["least_round_trip_ns"] = round_trip_json(host.min_round_trip);
   json["carried_bytes_per_s"] =
       host.carried_bytes_per_s > 0 ? Json(host.carried_bytes_per_s) : Json();
-  json["streams"] = is_connected(host) ? Json(host.streams) : Json();
+  json["streams"] = is_up(host.state) ? Json(host.streams) : Json();
   json["clock_bound_ns"] = bound_json(host.clock_bound());
   json["insecure"] = host.insecure;
   json["reason"] = host.reason == HostReason::none ? Json() : Json(name_of(host.reason));
@@ -106,7 +104,7 @@ std::vector<std::string> host_row(const HostInfo& host) {
           or_dash(list_text(host.found_by)),
           or_dash(escaped(host.version)),
           host.round_trip > Duration::zero() ? duration_text(host.round_trip) : "-",
-          is_connected(host) ? std::to_string(host.streams) : "-",
+          is_up(host.state) ? std::to_string(host.streams) : "-",
           bound_text(host.clock_bound()),
           note(host)};
 }

@@ -24,6 +24,8 @@ std::vector<std::string> host_row(const HostInfo& host);  // a cell for each col
 
 Json host_json(const HostInfo& host);
 
+bool is_up(HostState state);  // this host, or one that answers
+
 bool is_good(const ClockSnapshot& clock);             // its bound is within the limit
 std::string status_text(const ClockSnapshot& clock);  // "out of bounds: stepped"
 

@@ -618,7 +618,7 @@ Finding host_finding(const Facts& facts, const HostInfo& host, bool also_up) {
 void check_hosts(const Facts& facts, Findings& findings) {
   std::set<std::string> up;  // ids
   for (const HostInfo& host : facts.hosts) {
-    if (host.state == HostState::up || host.state == HostState::self) up.insert(host.id);
+    if (is_up(host.state)) up.insert(host.id);
   }
   for (const HostInfo& host : facts.hosts) {
     if (host.state == HostState::self) {

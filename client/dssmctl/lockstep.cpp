@@ -72,7 +72,7 @@ bool are_all_asleep(pid_t process, const std::set<pid_t>& except) {
   return count && sleep_count_of_all(process, except) == count;
 }
 
-std::string status_text(int status) {
+std::string end_text(int status) {
   if (WIFSIGNALED(status)) {
     return fmt::format("was ended by signal {} ({})", WTERMSIG(status),
                        ::sigdescr_np(WTERMSIG(status)));
@@ -202,7 +202,7 @@ Result<void> Lockstep::finish() {
   for (Program* const program : running) {
     if (program->runs || is_end_by_interrupt(program->status)) continue;
     return Error{Errc::unavailable,
-                 fmt::format("'{}' {}", escaped(program->command), status_text(program->status))};
+                 fmt::format("'{}' {}", escaped(program->command), end_text(program->status))};
   }
   if (!ended) {
     out_.clear_line();
@@ -217,8 +217,8 @@ Result<bool> Lockstep::check_ends() {
     if (program->runs && ::waitpid(program->process, &program->status, WNOHANG) != 0) {
       program->runs = false;
       if (program->status != 0) {
-        return Error{Errc::unavailable, fmt::format("'{}' {}", escaped(program->command),
-                                                    status_text(program->status))};
+        return Error{Errc::unavailable,
+                     fmt::format("'{}' {}", escaped(program->command), end_text(program->status))};
       }
     }
     is_any |= program->runs;

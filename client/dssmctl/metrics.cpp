@@ -23,6 +23,7 @@
 #include <utility>
 #include <vector>
 
+#include "client/dssmctl/describe.hpp"
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/options.hpp"
 #include "core/base/time.hpp"
@@ -149,13 +150,10 @@ void add_hosts(std::string& text, const std::vector<HostInfo>& hosts) {
         text, hosts, name, "gauge", help,
         [](const HostInfo& host) { return label("host", host.name); }, value);
   };
-  const auto is_up = [](const HostInfo& host) {
-    return host.state == HostState::self || host.state == HostState::up;
-  };
   add("dssm_host_up", "1: this host, or one that is connected; 0: one that is known, but is not.",
-      [&](const HostInfo& host) { return is_up(host) ? 1 : 0; });
+      [&](const HostInfo& host) { return is_up(host.state) ? 1 : 0; });
   add("dssm_host_streams", "Streams that the host owns.",
-      [&](const HostInfo& host) { return is_up(host) ? Number(host.streams) : Number(); });
+      [&](const HostInfo& host) { return is_up(host.state) ? Number(host.streams) : Number(); });
   add("dssm_host_round_trip_seconds", "Of the last heartbeat from this host.",
       [](const HostInfo& host) {
         return host.round_trip > Duration::zero() ? Number(seconds(host.round_trip)) : Number();
@@ -164,11 +162,11 @@ void add_hosts(std::string& text, const std::vector<HostInfo>& hosts) {
       [&](const HostInfo& host) { return known_bound(host.clock_bound()); });
   add("dssm_clock_distance_seconds", "How far the host's clock may be from this host's.",
       [&](const HostInfo& host) {
-        return is_up(host) ? known_bound(host.clock_distance) : Number();
+        return is_up(host.state) ? known_bound(host.clock_distance) : Number();
       });
   add("dssm_clock_refused", "1: reads by time refuse the host's samples here, for its clock.",
       [&](const HostInfo& host) {
-        return is_up(host) ? Number(host.clock_refused ? 1 : 0) : Number();
+        return is_up(host.state) ? Number(host.clock_refused ? 1 : 0) : Number();
       });
 }
 

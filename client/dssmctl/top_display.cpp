@@ -281,18 +281,18 @@ std::string headline(const TopState& state, bool is_connected, bool iso, std::si
                               counted(streams.size(), "stream", "streams"), live, stalled));
 
   // A host has a row for each address; one that has never answered has no name yet.
-  std::map<std::string, bool> is_up;
+  std::map<std::string, bool> hosts;
   std::size_t unnamed = 0;
   for (const HostInfo& host : state.hosts) {
-    const bool up = host.state == HostState::self || host.state == HostState::up;
+    const bool up = is_up(host.state);
     if (host.name.empty()) {
       ++unnamed;
     } else {
-      is_up[host.name] |= up;
+      hosts[host.name] |= up;
     }
   }
-  const auto up = std::count_if(is_up.begin(), is_up.end(), [](const auto& e) { return e.second; });
-  parts.push_back(fmt::format("{} of {} up", up, counted(is_up.size() + unnamed, "host", "hosts")));
+  const auto up = std::count_if(hosts.begin(), hosts.end(), [](const auto& e) { return e.second; });
+  parts.push_back(fmt::format("{} of {} up", up, counted(hosts.size() + unnamed, "host", "hosts")));
   if (!state.hosts.empty()) {
     parts.push_back("clock " + bound_text(state.hosts.front().clock_bound()));
   }

@@ -41,10 +41,6 @@ bool is_about(const std::string& pattern, const StreamId& stream) {
   return stream.name != kTriggerStream && StreamFilter({}, {pattern}).takes(stream);
 }
 
-bool is_there(const HostInfo& host) {
-  return host.state == HostState::up || host.state == HostState::self;
-}
-
 // Printable: it comes into files, whose texts are UTF-8, and into the journal.
 template <std::size_t N>
 std::string text_untrusted(const char (&text)[N]) {
@@ -214,7 +210,7 @@ void TriggerEvaluator::on_lists(const std::vector<StreamInfo>& streams,
       continue;
     }
     const bool is_removed = std::any_of(hosts.begin(), hosts.end(), [&](const HostInfo& host) {
-      return host.name == known.id.host && is_there(host);
+      return host.name == known.id.host && is_up(host.state);
     });
     for (const TriggerRule& rule : rules_) {
       if (is_removed || !known.live || rule.kind != Kind::stalled) continue;
@@ -247,7 +243,7 @@ void TriggerEvaluator::check_stream(const TriggerRule& rule, const StreamInfo& s
 void TriggerEvaluator::check_clocks(const std::vector<HostInfo>& hosts, Time now) {
   std::map<std::string, bool> good;
   for (const HostInfo& host : hosts) {
-    if (!is_there(host)) continue;
+    if (!is_up(host.state)) continue;
     const bool is_own = host.state == HostState::self;
     const bool is_good_now =
         is_own ? !host.clock || is_good(*host.clock) : host.clock_reason.empty();

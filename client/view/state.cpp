@@ -16,8 +16,6 @@ namespace {
 
 using ctl::Json;
 
-bool is_up(HostState state) { return state == HostState::up || state == HostState::self; }
-
 // The time of the oldest sample that the stream's ring holds, about: by its rate.
 std::optional<Time> oldest_time(const StreamInfo& stream) {
   if (stream.newest == kNoTid) return std::nullopt;
@@ -141,14 +139,14 @@ void StateCollector::find_events(const std::vector<HostInfo>& hosts) {
     new_hosts[host.name] = {host.state, host.clock_refused};
     if (is_first) continue;
     const auto known = hosts_.find(host.name);
-    const bool was_up = known != hosts_.end() && is_up(known->second.first);
-    if (is_up(host.state) != was_up) {
+    const bool was_up = known != hosts_.end() && ctl::is_up(known->second.first);
+    if (ctl::is_up(host.state) != was_up) {
       add_event(was_up, was_up ? fmt::format("host {} is down: {}", host.name,
                                              host.error.empty() ? "no answer" : host.error)
                                : fmt::format("host {} is up", host.name));
     }
     const bool was_refused = known != hosts_.end() && known->second.second;
-    if (host.clock_refused != was_refused && is_up(host.state)) {
+    if (host.clock_refused != was_refused && ctl::is_up(host.state)) {
       add_event(
           host.clock_refused,
           host.clock_refused
@@ -157,7 +155,7 @@ void StateCollector::find_events(const std::vector<HostInfo>& hosts) {
     }
   }
   for (const auto& [name, state] : hosts_) {
-    if (is_up(state.first) && !new_hosts.contains(name)) {
+    if (ctl::is_up(state.first) && !new_hosts.contains(name)) {
       add_event(true, fmt::format("host {} is down: it is not known any more", name));
     }
   }

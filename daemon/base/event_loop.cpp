@@ -17,7 +17,7 @@ namespace {
   (*static_cast<EventSource::Callback*>(callback))();
 }
 
-constexpr timeval kAtOnce{};
+constexpr timeval kNoDelay{};
 
 // Without a lock, because there is one thread; without reading the clock in each turn, because
 // libevent keeps none of our times (TimerQueue does).
@@ -131,7 +131,7 @@ void EventLoop::watch_timers() {
   timer_is_due_.reset(event_new(
       base(), timers_->fd(), EV_READ | EV_ET | EV_PERSIST,
       [](evutil_socket_t, short, void* run_timers) noexcept {
-        DSSM_CHECK(event_add(static_cast<event*>(run_timers), &kAtOnce) == 0);
+        DSSM_CHECK(event_add(static_cast<event*>(run_timers), &kNoDelay) == 0);
       },
       run_timers_.get()));
   DSSM_CHECK(timer_is_due_ && event_add(timer_is_due_.get(), nullptr) == 0);
@@ -187,7 +187,7 @@ void EventSource::enable_in(Duration delay) noexcept {
   timer_->stop();
   // libevent would put one that is due at the end again: enabled in each turn, it would never run.
   if (event_pending(event_.get(), EV_TIMEOUT, nullptr)) return;
-  DSSM_CHECK(event_add(event_.get(), &kAtOnce) == 0);
+  DSSM_CHECK(event_add(event_.get(), &kNoDelay) == 0);
 }
 
 void EventSource::disable() noexcept {

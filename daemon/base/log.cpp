@@ -41,12 +41,12 @@ bool takes_a_line() noexcept {
 }
 
 // An entry longer than the socket's buffer would have to go by a file; no message of dssmd is.
-constexpr std::size_t kMaxMessageBytes = 16 << 10;
+constexpr std::size_t kMaxFieldBytes = 16 << 10;
 
 // printable(): a line break would begin another field.
 void add_field(std::string& entry, std::string_view name, std::string_view value) {
   if (value.empty()) return;
-  entry.append(name).append("=").append(printable(value.substr(0, kMaxMessageBytes))).append("\n");
+  entry.append(name).append("=").append(printable(value.substr(0, kMaxFieldBytes))).append("\n");
 }
 
 }  // namespace

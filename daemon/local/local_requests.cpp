@@ -13,7 +13,7 @@ namespace dssm::daemon {
 namespace {
 
 // Of a StreamList; the rest of a frame is for the response around it.
-constexpr std::size_t kMaxListBytes = wire::kMaxLocalFrameBytes - (1U << 20);
+constexpr std::size_t kMaxLocalListBytes = wire::kMaxLocalFrameBytes - (1U << 20);
 
 Role role_of(bool for_writing) noexcept { return for_writing ? Role::writer : Role::reader; }
 
@@ -42,9 +42,9 @@ Result<Reply> with_streams(Reply reply, std::vector<proto::Stream> streams) {
   proto::StreamList& list = *reply.response.mutable_stream_list();
   std::size_t bytes = list.ByteSizeLong();
   for (proto::Stream& stream : streams) {
-    if (bytes + stream.ByteSizeLong() > kMaxListBytes) stream.mutable_type()->clear_fields();
+    if (bytes + stream.ByteSizeLong() > kMaxLocalListBytes) stream.mutable_type()->clear_fields();
     bytes += stream.ByteSizeLong();
-    if (bytes > kMaxListBytes) {
+    if (bytes > kMaxLocalListBytes) {
       return Error{Errc::limit_exceeded,
                    "the list of all hosts' streams is longer than one message may be; ask for "
                    "those of this host only"};
@@ -69,7 +69,7 @@ LocalRequests::LocalRequests(Registry& registry, OpenTable& opens, PlaybackClock
       clock_(clock),
       rights_(rights),
       fleet_(fleet),
-      catalog_(registry, opens, kMaxListBytes) {}
+      catalog_(registry, opens, kMaxLocalListBytes) {}
 
 // An id without a host belongs to this one if it has such a stream.
 bool LocalRequests::is_elsewhere(const StreamId& id) const {
@@ -337,7 +337,7 @@ void LocalRequests::list_nodes(Answer answer) {
     Reply reply;
     proto::NodeList& list = *reply.response.mutable_node_list();
     nodes.to_message(list);
-    if (list.ByteSizeLong() <= kMaxListBytes) return answer(std::move(reply));
+    if (list.ByteSizeLong() <= kMaxLocalListBytes) return answer(std::move(reply));
     answer(Error{Errc::limit_exceeded,
                  "the list of all hosts' processes is longer than one message may be"});
   });
@@ -348,7 +348,7 @@ void LocalRequests::list_clock_pairs(Answer answer) {
     Reply reply;
     proto::ClockPairList& list = *reply.response.mutable_clock_pair_list();
     for (const ClockPair& pair : pairs) wire::to_message(pair, *list.add_pairs());
-    if (list.ByteSizeLong() <= kMaxListBytes) return answer(std::move(reply));
+    if (list.ByteSizeLong() <= kMaxLocalListBytes) return answer(std::move(reply));
     answer(Error{Errc::limit_exceeded,
                  "the list of all hosts' clocks is longer than one message may be"});
   });

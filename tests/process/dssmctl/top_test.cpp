@@ -137,10 +137,10 @@ class TerminalScreen {
 };
 
 // So many fields that details are longer than the screen.
-struct Pose {
+struct Attitude {
   double x, y, z, roll, pitch, yaw;
 };
-DSSM_DESCRIBE(Pose, x, y, z, roll, pitch, yaw)
+DSSM_DESCRIBE(Attitude, x, y, z, roll, pitch, yaw)
 
 class TopOnATerminal : public FleetTest {
  protected:
@@ -229,8 +229,8 @@ class TopOnATerminal : public FleetTest {
     EXPECT_TRUE(now.c_lflag & ICANON);
   }
 
-  Writer<Pose> create(Session& session, const std::string& name, std::uint64_t depth) {
-    return session.create<Pose>(name, depth_of(depth)).value();
+  Writer<Attitude> create(Session& session, const std::string& name, std::uint64_t depth) {
+    return session.create<Attitude>(name, depth_of(depth)).value();
   }
 
   TerminalScreen screen_{24, 80};
@@ -239,8 +239,8 @@ class TopOnATerminal : public FleetTest {
   int terminal_ = -1;
   static constexpr std::string_view kDown = "\x1b[B", kEscape = "\x1b", kEnter = "\r",
                                     kEnd = "\x1b[F";
-  Writer<Pose> odometry_ = create(session_, "odometry", 16), lidar_ = create(session_, "lidar", 64),
-               camera_ = create(on_pc2_, "camera", 32);
+  Writer<Attitude> odometry_ = create(session_, "odometry", 16),
+                   lidar_ = create(session_, "lidar", 64), camera_ = create(on_pc2_, "camera", 32);
 };
 
 TEST_F(TopOnATerminal, ShowsThreeViews) {
@@ -462,8 +462,8 @@ TEST_F(TopOnATerminal, EscapesNamesAndStaysWithinTheWindow) {
 class TopRows : public CtlTest {};
 
 TEST_F(TopRows, AreHeadlineAndTable) {
-  auto odometry = session_.create<Pose>("odometry", depth_of(16)).value();
-  auto lidar = session_.create<Pose>("lidar", depth_of(64)).value();
+  auto odometry = session_.create<Attitude>("odometry", depth_of(16)).value();
+  auto lidar = session_.create<Attitude>("lidar", depth_of(64)).value();
   const Strings lines = lines_of(output({"top", "--sort", "name", "-n", "2", "-i", "10ms"}));
   ASSERT_EQ(lines.size(), 9U);
   for (const std::size_t first : {std::size_t{0}, std::size_t{5}}) {
@@ -482,7 +482,7 @@ TEST_F(TopRows, AreHeadlineAndTable) {
 }
 
 TEST_F(TopRows, AreALineOfJsonForEachUpdateAlsoWhileDssmdIsGone) {
-  auto odometry = session_.create<Pose>("odometry", depth_of(16)).value();
+  auto odometry = session_.create<Attitude>("odometry", depth_of(16)).value();
   Running top(argv({"top", "--json", "-i", "20ms"}), environment());
   Json state = Json::parse(top.line());
   EXPECT_GT(state["time_ns"], 0);
