@@ -4,8 +4,12 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <optional>
+#include <span>
+#include <utility>
 
 #include "client/dssmctl/text.hpp"
+#include "client/view/streams.hpp"
 
 namespace dssm::view {
 namespace {
@@ -13,6 +17,54 @@ namespace {
 constexpr double kNone = std::numeric_limits<double>::quiet_NaN();
 
 double seconds(Duration duration) { return std::chrono::duration<double>(duration).count(); }
+
+// Makes a range of the samples that are read one after the other.
+class RangeBuilder {
+ public:
+  //   count  of samples in the range, about; none: not known
+  RangeBuilder(const std::vector<ctl::FieldElement>& fields, Time from, Time to, std::size_t points,
+               std::optional<std::uint64_t> count)
+      : fields_(fields), from_(from), values_(fields.size()) {
+    const std::size_t wanted = std::max<std::size_t>(points, 2);
+    const bool is_thinned = !count || *count >= wanted;
+    const Duration length = std::max(ctl::saturating_sub(to, from), Duration(1));
+    // Without thinning each sample has a slice of its own.
+    const std::size_t slices = is_thinned ? wanted / 2 : std::numeric_limits<std::uint32_t>::max();
+    builders_.assign(fields.size(), CurveBuilder(length, slices));
+  }
+
+  // The values of a sample, for the next add(): a borrowed sample must be checked in between.
+  void read(std::span<const std::byte> payload) {
+    for (std::size_t i = 0; i < fields_.size(); ++i) {
+      values_[i] = ctl::element_number(payload, fields_[i].field, fields_[i].element.value_or(0))
+                       .value_or(kNone);
+    }
+  }
+  void add(const SampleInfo& info, Duration clock_error) {
+    ++range.samples;
+    range.clock_error = std::max(range.clock_error, clock_error);
+    const Duration time = ctl::saturating_sub(info.time, from_);
+    for (std::size_t i = 0; i < fields_.size(); ++i) {
+      builders_[i].add(time, info.tid, values_[i], is_after_gap_);
+    }
+    is_after_gap_ = false;
+  }
+  void add_gap() { is_after_gap_ = range.samples > 0; }
+
+  SignalRange take() {
+    for (CurveBuilder& builder : builders_) range.curves.push_back(builder.take());
+    return std::move(range);
+  }
+
+  SignalRange range;
+
+ private:
+  const std::vector<ctl::FieldElement>& fields_;
+  Time from_;
+  std::vector<double> values_;
+  std::vector<CurveBuilder> builders_;
+  bool is_after_gap_ = false;
+};
 
 }  // namespace
 
@@ -38,7 +90,7 @@ void CurveBuilder::add(Duration time, Tid tid, double value, bool is_after_gap) 
 
 void CurveBuilder::end_slice() {
   if (!has_points_) return;
-  const bool is_rising = least_.tid <= greatest_.tid;
+  const bool is_rising = least_.time <= greatest_.time;
   const Point& first = is_rising ? least_ : greatest_;
   if (is_after_gap_) put({first.time, first.tid, kNone});
   put(first);
@@ -78,50 +130,70 @@ SignalRange read_signals(RawReader& reader, const std::vector<ctl::FieldElement>
   range.left_out = static_cast<std::uint64_t>(std::max<Tid>(oldest_read - first, 0));
   first = std::max(first, oldest_read);
 
-  const std::size_t wanted = std::max<std::size_t>(points, 2);
-  const bool is_thinned = static_cast<std::uint64_t>(last - first) >= wanted;
-  const Duration length = std::max(ctl::saturating_sub(to, from), Duration(1));
-  std::vector<CurveBuilder> builders;
-  for (std::size_t i = 0; i < fields.size(); ++i) {
-    // Without thinning each sample has a slice of its own.
-    builders.emplace_back(length,
-                          is_thinned ? wanted / 2 : std::numeric_limits<std::uint32_t>::max());
-  }
-  bool is_after_gap = false;
-  std::vector<double> values(fields.size());
+  RangeBuilder builder(fields, from, to, points, static_cast<std::uint64_t>(last - first));
+  builder.range = range;
   for (Tid tid = first; tid <= last; ++tid) {
     BorrowedSample sample;
     const ReadStatus status = reader.borrow(tid, sample);
     if (status == ReadStatus::restarted) {
+      range = {};
       range.status = status;
       return range;
     }
-    bool is_read = status == ReadStatus::ok;
-    if (is_read) {
-      for (std::size_t i = 0; i < fields.size(); ++i) {
-        values[i] =
-            ctl::element_number(sample.payload(), fields[i].field, fields[i].element.value_or(0))
-                .value_or(kNone);
+    if (status == ReadStatus::not_yet) break;
+    if (status == ReadStatus::ok) {
+      builder.read(sample.payload());
+      if (sample.still_valid()) {
+        builder.add(sample.info(), reader.clock_error(sample.info()));
+        continue;
       }
-      is_read = sample.still_valid();
     }
-    if (!is_read) {
-      if (status == ReadStatus::not_yet) break;
-      if (status == ReadStatus::arriving) range.status = status;
-      range.lost += status != ReadStatus::arriving;
-      is_after_gap = range.samples > 0;
-      continue;
+    if (status == ReadStatus::arriving) {
+      builder.range.status = status;
+    } else {
+      ++builder.range.lost;
     }
-    ++range.samples;
-    range.clock_error = std::max(range.clock_error, reader.clock_error(sample.info()));
-    const Duration time = ctl::saturating_sub(sample.info().time, from);
-    for (std::size_t i = 0; i < fields.size(); ++i) {
-      builders[i].add(time, tid, values[i], is_after_gap);
-    }
-    is_after_gap = false;
+    builder.add_gap();
   }
-  for (CurveBuilder& builder : builders) range.curves.push_back(builder.take());
-  return range;
+  return builder.take();
+}
+
+SignalRange read_signals(RecordedRawReader& reader, const std::vector<ctl::FieldElement>& fields,
+                         Time from, Time to, std::size_t points) {
+  std::vector<std::byte> payload(reader.payload_bytes());
+  SampleInfo info;
+  const std::uint64_t lost_before = reader.lost_samples();
+  // The samples before and after the range, so that a line enters and leaves it.
+  ReadStatus status = past_restarts([&] { return reader.read_at(from, payload, info); });
+  if (status != ReadStatus::ok) {
+    status = past_restarts([&] { return reader.read_at_or_after(from, payload, info); });
+  }
+  reader.seek(info.tid);
+  SampleInfo last;
+  std::optional<std::uint64_t> count;
+  if (reader.find(to, last) == ReadStatus::ok && last.tid >= info.tid) {
+    count = static_cast<std::uint64_t>(last.tid - info.tid);
+  }
+  RangeBuilder builder(fields, from, to, points, count);
+  while (status == ReadStatus::ok) {
+    if (builder.range.samples >= kMaxSignalSamples) {
+      builder.range.left_out = static_cast<std::uint64_t>(std::max<Tid>(last.tid - info.tid, 1));
+      break;
+    }
+    builder.read(std::span(payload).first(info.payload_bytes));
+    builder.add(info, reader.clock_error(info));
+    if (info.time > to) break;
+    const Tid before = info.tid;
+    status = reader.read_next(payload, info);
+    if (status == ReadStatus::restarted) {
+      status = past_restarts([&] { return reader.read_next(payload, info); });
+      builder.add_gap();
+    } else if (status == ReadStatus::ok && info.tid != before + 1) {
+      builder.add_gap();
+    }
+  }
+  builder.range.lost = reader.lost_samples() - lost_before;
+  return builder.take();
 }
 
 }  // namespace dssm::view

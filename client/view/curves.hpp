@@ -6,6 +6,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <dssm/reader.hpp>
+#include <dssm/recording.hpp>
 #include <string>
 #include <vector>
 
@@ -55,23 +56,26 @@ class CurveBuilder {
   Curve curve_;
 };
 
-// What a reader's ring holds of a range of time.
+// What a reader's ring, or a recording, holds of a range of time.
 struct SignalRange {
   // arriving: another host's history is on its way; too_old: all of it is older than the ring's
   // samples; restarted: nothing was read.
   ReadStatus status = ReadStatus::ok;
   std::uint64_t samples = 0;   // that were read
   std::uint64_t lost = 0;      // that are missing between them
-  std::uint64_t left_out = 0;  // before the first that was read: kMaxSignalSamples
+  std::uint64_t left_out = 0;  // of the range because of kMaxSignalSamples, about
   Duration clock_error{};      // the greatest bound; kUnknownClockError: unknown
   std::vector<Curve> curves;   // of each field
 };
 
-// At most so many samples are read, the last ones of the range.
+// At most so many samples are read: the last ones of the range in a ring, the first in a recording.
 inline constexpr std::uint64_t kMaxSignalSamples = 500'000;
 
 //   points  of each curve at most, about; >= 2
 SignalRange read_signals(RawReader& reader, const std::vector<ctl::FieldElement>& fields, Time from,
                          Time to, std::size_t points);
+// Of all incarnations.
+SignalRange read_signals(RecordedRawReader& reader, const std::vector<ctl::FieldElement>& fields,
+                         Time from, Time to, std::size_t points);
 
 }  // namespace dssm::view

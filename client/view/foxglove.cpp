@@ -5,12 +5,17 @@
 
 #include <algorithm>
 #include <array>
+#include <chrono>
+#include <cstring>
 #include <limits>
 #include <optional>
+#include <span>
+#include <string_view>
 #include <utility>
 
 #include "client/dssmctl/nodes.hpp"
 #include "client/dssmctl/output.hpp"
+#include "client/dssmctl/text.hpp"
 #include "client/recording/ros2_schema.hpp"
 #include "client/recording/stream_channel.hpp"
 
@@ -32,6 +37,13 @@ constexpr Duration kLossReportPeriod = std::chrono::seconds(2);
 // The first byte of a binary message.
 constexpr unsigned char kMessageData = 1;
 constexpr unsigned char kTime = 2;
+constexpr unsigned char kPlaybackState = 5;
+// Of a client.
+constexpr unsigned char kPlaybackControl = 3;
+
+// Of a recording, in one turn.
+constexpr int kMaxPlayedSamples = 2000;
+constexpr float kMaxSpeed = 1000;
 
 template <class Number>
 void put(std::vector<std::byte>& out, Number number) {
@@ -56,12 +68,19 @@ class FoxgloveConnection : public Connection {
  public:
   FoxgloveConnection(FoxgloveClients& clients, Peer& peer) : clients_(clients), peer_(peer) {
     clients_.connections_.insert(this);
-    send({{"op", "serverInfo"},
-          {"name", fmt::format("dssm-view on {}", clients_.host_)},
-          {"capabilities", {"time", "connectionGraph"}},
-          {"supportedEncodings", Json::array()},
-          {"metadata", {{"host", clients_.host_}}},
-          {"sessionId", clients_.session_id_}});
+    Json info = {{"op", "serverInfo"},
+                 {"name", fmt::format("dssm-view on {}", clients_.name_)},
+                 {"capabilities", {"time", "connectionGraph"}},
+                 {"supportedEncodings", Json::array()},
+                 {"metadata", {{"host", clients_.name_}}},
+                 {"sessionId", clients_.session_id_}};
+    if (const auto* recording = std::get_if<Recording>(&clients_.played_)) {
+      playback_.emplace(*recording);
+      info["capabilities"] = {"time", "playbackControl"};
+      info["dataStartTime"] = seconds_json(playback_->begin);
+      info["dataEndTime"] = seconds_json(playback_->end);
+    }
+    send(info);
     advertise();
   }
   FoxgloveConnection(const FoxgloveConnection&) = delete;
@@ -79,7 +98,7 @@ class FoxgloveConnection : public Connection {
     if (*op == "unsubscribe") return unsubscribe(request);
     if (*op == "subscribeConnectionGraph") {
       if (std::exchange(wants_graph_, true)) return;
-      clients_.collector_.want_all();
+      clients_.want_all_();
       return send_graph();
     }
     if (*op == "unsubscribeConnectionGraph") {
@@ -120,13 +139,44 @@ class FoxgloveConnection : public Connection {
     if (wants_graph_ && !clients_.graph_.empty()) peer_.send(Message::text(clients_.graph_));
   }
 
+  // Playback control: a command (0 play, 1 pause), a speed, whether and where to seek, and the text
+  // by which the client knows the answer.
+  void on_binary(std::string_view bytes) override {
+    if (peer_.waiting_bytes() > kMaxUnread) return peer_.close("messages are not read");
+    const auto code = take<std::uint8_t>(bytes);
+    if (!playback_ || code != kPlaybackControl) return;
+    const auto command = take<std::uint8_t>(bytes);
+    const auto speed = take<float>(bytes);
+    const auto has_seek = take<std::uint8_t>(bytes);
+    const auto seek_ns = take<std::uint64_t>(bytes);
+    const auto id_bytes = take<std::uint32_t>(bytes);
+    if (!id_bytes || *id_bytes != bytes.size() || *command > 1 || !(*speed > 0) ||
+        *speed > kMaxSpeed) {
+      return report(2, fmt::format("playback control is to play or to pause, with a speed up to {}",
+                                   kMaxSpeed));
+    }
+    const MonoTime now = MonoClock::now();
+    if (*has_seek != 0) seek(time_of(*seek_ns));
+    if (*command == 0 && playback_->is_ended()) seek(playback_->begin);
+    playback_->speed = *speed;
+    playback_->is_playing = *command == 0;
+    playback_->moved = now;
+    send_playback_state(*has_seek != 0, bytes);
+  }
+
   void send_samples(MonoTime now) {
-    for (auto& [id, subscription] : subscriptions_) send_samples(id, subscription);
+    if (playback_) {
+      play(now);
+    } else {
+      for (auto& [id, subscription] : subscriptions_) send_samples(id, subscription);
+    }
     if (now >= next_time_ && peer_.waiting_bytes() < kMaxWaitingBytes) {
       next_time_ = now + kTimePeriod;
+      const auto* clock = std::get_if<PlaybackClock>(&clients_.played_);
       std::vector<std::byte> message;
       put(message, kTime);
-      put(message, static_cast<std::uint64_t>(std::max(clients_.clock_.now_s(), 0.0) * 1e9));
+      put(message, clock ? static_cast<std::uint64_t>(std::max(clock->now_s(), 0.0) * 1e9)
+                         : recording::log_time_of(playback_->position));
       peer_.send(Message::binary({message}));
     }
     if (left_out_ > 0 && now >= next_report_) {
@@ -142,7 +192,158 @@ class FoxgloveConnection : public Connection {
     std::uint32_t channel = 0;
     Tid next = kNoTid;  // kNoTid: from the newest on
     std::uint64_t incarnation = 0;
+    bool wants_present = true;  // of a recording: it has not got a sample of the position yet
   };
+
+  // Where this client is in the recording.
+  struct Playback {
+    explicit Playback(const Recording& recording) : cursor(recording.cursor()) {
+      bool is_first = true;
+      for (const RecordedStreamInfo& stream : recording.streams()) {
+        names.push_back(stream.id.str());
+        if (stream.samples == 0) continue;
+        begin = is_first ? stream.first_time : std::min(begin, stream.first_time);
+        end = is_first ? stream.last_time : std::max(end, stream.last_time);
+        is_first = false;
+      }
+      position = begin;
+    }
+    bool is_ended() const { return position >= end; }
+
+    RecordingCursor cursor;
+    std::vector<std::string> names;  // of the streams, by their indices in the recording
+    Time begin{}, end{};
+    Time position{};                     // what is before it was sent
+    std::optional<RecordedSample> next;  // the cursor's, which is not due yet
+    float speed = 1;
+    bool is_playing = false;
+    MonoTime moved{};  // when `position` was set
+  };
+
+  static Time time_of(std::uint64_t log_time) {
+    constexpr std::uint64_t kGreatest = std::numeric_limits<std::int64_t>::max();
+    return time_from_ns(static_cast<std::int64_t>(std::min(log_time, kGreatest)));
+  }
+
+  static Json seconds_json(Time time) {
+    const std::uint64_t ns = recording::log_time_of(time);
+    return {{"sec", ns / 1'000'000'000}, {"nsec", ns % 1'000'000'000}};
+  }
+
+  template <class Number>
+  static std::optional<Number> take(std::string_view& bytes) {
+    Number number;
+    if (bytes.size() < sizeof number) {
+      bytes = {};
+      return std::nullopt;
+    }
+    std::memcpy(&number, bytes.data(), sizeof number);
+    bytes.remove_prefix(sizeof number);
+    return number;
+  }
+
+  void send_playback_state(bool did_seek, std::string_view request_id) {
+    const std::uint8_t status = playback_->is_ended() ? 3 : playback_->is_playing ? 0 : 1;
+    std::vector<std::byte> message;
+    put(message, kPlaybackState);
+    put(message, status);
+    put(message, recording::log_time_of(playback_->position));
+    put(message, playback_->speed);
+    put(message, static_cast<std::uint8_t>(did_seek));
+    put(message, static_cast<std::uint32_t>(request_id.size()));
+    const auto id = std::as_bytes(std::span(request_id));
+    message.insert(message.end(), id.begin(), id.end());
+    peer_.send(Message::binary({message}));
+  }
+
+  // Every subscription gets the sample of that time, too, so that what is paused is shown.
+  void seek(Time time) {
+    playback_->position = std::clamp(time, playback_->begin, playback_->end);
+    playback_->cursor.seek(playback_->position);
+    playback_->next.reset();
+    for (auto& [id, subscription] : subscriptions_) subscription.wants_present = true;
+  }
+
+  void play(MonoTime now) {
+    for (auto& [id, subscription] : subscriptions_) {
+      if (subscription.wants_present) send_present(id, subscription);
+    }
+    Playback& playback = *playback_;
+    if (!playback.is_playing) return;
+    const auto passed = std::chrono::duration<double>(now - playback.moved) * playback.speed;
+    const Time until = std::min(
+        ctl::saturating_add(playback.position, std::chrono::duration_cast<Duration>(passed)),
+        playback.end);
+    std::map<std::string, std::vector<std::uint32_t>> subscribers;
+    for (const auto& [id, subscription] : subscriptions_) {
+      const auto channel = clients_.channels_.find(subscription.channel);
+      if (channel != clients_.channels_.end()) subscribers[channel->second.stream].push_back(id);
+    }
+    for (int i = 0;; ++i) {
+      if (!playback.next) {
+        RecordedSample sample;
+        if (!playback.cursor.next(sample)) break;
+        playback.next = sample;
+      }
+      const RecordedSample& sample = *playback.next;
+      if (sample.info.time > until) break;
+      if (i == kMaxPlayedSamples || peer_.waiting_bytes() >= kMaxWaitingBytes) {
+        // The client is slower than its speed: it gets all, later.
+        playback.position = std::clamp(sample.info.time, playback.position, until);
+        playback.moved = now;
+        return;
+      }
+      const auto found = subscribers.find(playback.names[sample.stream]);
+      if (found != subscribers.end()) {
+        for (const std::uint32_t id : found->second) {
+          send_sample(id, clients_.channels_.at(subscriptions_.at(id).channel), sample.info,
+                      sample.payload);
+        }
+      }
+      playback.next.reset();
+    }
+    playback.position = until;
+    playback.moved = now;
+    if (playback.is_ended()) {
+      playback.is_playing = false;
+      send_playback_state(false, {});
+    }
+  }
+
+  // The sample that the stream had at the position.
+  void send_present(std::uint32_t id, Subscription& subscription) {
+    const auto channel = clients_.channels_.find(subscription.channel);
+    if (channel == clients_.channels_.end()) return;
+    const Streams::Found found = clients_.streams_.find(channel->second.stream);
+    if (!found.stream) return;  // it is being opened
+    RecordedRawReader& reader = std::get<RecordedRawReader>(found.stream->reader);
+    std::vector<std::byte> payload(reader.payload_bytes());
+    SampleInfo info;
+    const ReadStatus status =
+        past_restarts([&] { return reader.read_at(playback_->position, payload, info); });
+    subscription.wants_present = false;
+    if (status == ReadStatus::ok) {
+      send_sample(id, channel->second, info, std::span(payload).first(info.payload_bytes));
+    }
+  }
+
+  void send_sample(std::uint32_t id, const FoxgloveClients::Channel& channel,
+                   const SampleInfo& info, std::span<const std::byte> payload) {
+    peer_.send(Message::binary({sample_message(id, channel, info, payload)}));
+  }
+
+  static std::vector<std::byte> sample_message(std::uint32_t id,
+                                               const FoxgloveClients::Channel& channel,
+                                               const SampleInfo& info,
+                                               std::span<const std::byte> payload) {
+    std::vector<std::byte> message;
+    message.reserve(payload.size() + 32);
+    put(message, kMessageData);
+    put(message, id);
+    put(message, recording::log_time_of(info.time));
+    put_sample(message, channel.type, payload);
+    return message;
+  }
 
   void send(const Json& message) { peer_.send(Message::text(ctl::json_text(message))); }
   // level: 0 info, 1 warning, 2 error
@@ -172,7 +373,7 @@ class FoxgloveConnection : public Connection {
         report(2, "a subscription names a channel that does not exist");
       } else if (subscriptions_.size() >= kMaxSubscriptions) {
         report(2, "too many subscriptions");
-      } else if (!subscriptions_.emplace(*id, Subscription{*channel, kNoTid, 0}).second) {
+      } else if (!subscriptions_.emplace(*id, Subscription{*channel, kNoTid, 0, true}).second) {
         report(1, fmt::format("there is a subscription {} already", *id));
       }
     }
@@ -191,7 +392,7 @@ class FoxgloveConnection : public Connection {
     if (channel == clients_.channels_.end()) return;
     OpenStream* const stream = clients_.streams_.find(channel->second.stream).stream;
     if (!stream) return;
-    RawReader& reader = stream->reader;
+    RawReader& reader = std::get<RawReader>(stream->reader);
     if (subscription.incarnation != reader.incarnation()) {
       subscription.incarnation = reader.incarnation();
       subscription.next = kNoTid;
@@ -220,12 +421,8 @@ class FoxgloveConnection : public Connection {
         ++left_out_;
         continue;
       }
-      std::vector<std::byte> message;
-      message.reserve(sample.payload().size() + 32);
-      put(message, kMessageData);
-      put(message, id);
-      put(message, recording::log_time_of(sample.info().time));
-      put_sample(message, channel->second.type, sample.payload());
+      const std::vector<std::byte> message =
+          sample_message(id, channel->second, sample.info(), sample.payload());
       if (sample.still_valid()) {
         peer_.send(Message::binary({message}));
       } else {
@@ -238,17 +435,18 @@ class FoxgloveConnection : public Connection {
   Peer& peer_;
   std::set<std::uint32_t> advertised_;                   // channels
   std::map<std::uint32_t, Subscription> subscriptions_;  // by the client's ids
+  std::optional<Playback> playback_;                     // of a recording
   bool wants_graph_ = false;
   std::uint64_t left_out_ = 0;  // samples, since the last report
   MonoTime next_time_{}, next_report_{};
 };
 
-FoxgloveClients::FoxgloveClients(std::string host, Streams& streams, StateCollector& collector,
-                                 PlaybackClock clock)
-    : host_(std::move(host)),
+FoxgloveClients::FoxgloveClients(std::string name, Streams& streams, std::function<void()> want_all,
+                                 std::variant<PlaybackClock, Recording> played)
+    : name_(std::move(name)),
       streams_(streams),
-      collector_(collector),
-      clock_(std::move(clock)),
+      want_all_(std::move(want_all)),
+      played_(std::move(played)),
       session_id_(std::to_string(to_ns(WallClock::now()))) {}
 
 std::unique_ptr<Connection> FoxgloveClients::connect(Peer& peer) {
@@ -313,7 +511,7 @@ void FoxgloveClients::on_state(const VehicleState& state) {
   graph_ = graph;
   for (FoxgloveConnection* connection : connections_) {
     connection->advertise();
-    if (connection->wants_graph()) collector_.want_all();  // that is, the next one, too
+    if (connection->wants_graph()) want_all_();  // that is, the next one, too
     if (is_new_graph) connection->send_graph();
   }
 }

@@ -5,15 +5,19 @@
 // samples are CDR with a ROS 2 schema, as in recordings (docs/recording.md).
 //
 // Samples are sent as they come. Of those that the other end does not take in time none waits here
-// beyond a budget: they are left out, and it is told how many.
+// beyond a budget: they are left out, and it is told how many. A recording is played to each client
+// as that asks for it ("playback control"), at the client's pace.
 #pragma once
 
 #include <cstdint>
+#include <dssm/recording.hpp>
 #include <dssm/session.hpp>
+#include <functional>
 #include <map>
 #include <memory>
 #include <set>
 #include <string>
+#include <variant>
 #include <vector>
 
 #include "client/view/server.hpp"
@@ -27,10 +31,12 @@ class FoxgloveConnection;
 // All clients. In the server's thread.
 class FoxgloveClients {
  public:
-  // `streams` and `collector` outlive it.
-  //   host  this one's name
-  FoxgloveClients(std::string host, Streams& streams, StateCollector& collector,
-                  PlaybackClock clock);
+  // `streams` outlives it.
+  //   name      of the host or of the recording
+  //   want_all  called when a client wants to know the programs: the next state is to have them
+  //   played    the vehicle's clock, or the recording
+  FoxgloveClients(std::string name, Streams& streams, std::function<void()> want_all,
+                  std::variant<PlaybackClock, Recording> played);
 
   std::unique_ptr<Connection> connect(Peer& peer);
 
@@ -50,10 +56,10 @@ class FoxgloveClients {
     std::string advertisement;  // JSON
   };
 
-  const std::string host_;
+  const std::string name_;
   Streams& streams_;
-  StateCollector& collector_;
-  PlaybackClock clock_;
+  const std::function<void()> want_all_;
+  std::variant<PlaybackClock, Recording> played_;
   std::map<std::uint32_t, Channel> channels_;  // by their ids
   std::uint32_t last_channel_ = 0;
   std::string graph_;  // the message about programs and streams

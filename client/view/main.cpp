@@ -2,7 +2,7 @@
 //
 // dssm-view: shows the streams of all hosts in a web browser, to Foxglove, and their figures to
 // Prometheus. It is a reader as any other: what it does, or a browser that hangs, delays no other
-// program.
+// program. Or it shows a recording.
 //
 // Exit status: 0 ended by a signal, 1 failure, 2 wrong usage.
 #include <fmt/format.h>
@@ -11,9 +11,12 @@
 #include <CLI/CLI.hpp>
 #include <algorithm>
 #include <cstdio>
+#include <dssm/recording.hpp>
 #include <dssm/session.hpp>
+#include <optional>
 #include <string>
 #include <utility>
+#include <variant>
 #include <vector>
 
 #include "client/dssmctl/config_words.hpp"
@@ -35,10 +38,13 @@ constexpr int kFailure = 1;
 constexpr int kWrongUsage = 2;
 
 constexpr Duration kClosePeriod = std::chrono::seconds(5);
+// How often a recording's state is given to pages, which wait for the next one.
+constexpr Duration kStatePeriod = std::chrono::seconds(1);
 
 struct Options {
   std::string listen = "127.0.0.1:8765";
   std::string socket_path;
+  std::string recording;  // a file or folder; empty: the vehicle
   bool insecure = false;
   ServerOptions server;
 };
@@ -75,44 +81,66 @@ Result<void> split_listen(Options& options) {
   return {};
 }
 
-Result<void> serve(Options options) {
-  DSSM_TRY(split_listen(options));
+// The vehicle, or the recording.
+Result<Source> open_source(const Options& options) {
+  if (!options.recording.empty()) return Source(DSSM_TRY(Recording::open(options.recording)));
   SessionOptions session_options;
   session_options.socket_path = options.socket_path;
   session_options.program = "dssm-view";
   session_options.on_notice = [](const std::string&) {};
-  Session session = DSSM_TRY(Session::connect(session_options));
-  PlaybackClock clock = DSSM_TRY(session.open_playback_clock());
+  return Source(DSSM_TRY(Session::connect(session_options)));
+}
+
+Result<void> serve(Options options) {
+  DSSM_TRY(split_listen(options));
+  Source source = DSSM_TRY(open_source(options));
+  auto* const session = std::get_if<Session>(&source);  // none: a recording is shown
+  std::optional<VehicleState> recorded;
+  if (!session) recorded = recorded_state(std::get<Recording>(source));
+  const std::string shown = session ? DSSM_TRY(session->daemon_info()).host : recorded->host;
+  std::variant<PlaybackClock, Recording> played =
+      session ? std::variant<PlaybackClock, Recording>(DSSM_TRY(session->open_playback_clock()))
+              : std::get<Recording>(source);
 
   // Signals are for this thread: the others must not stop a server that may have ended.
   sigset_t all, before;
   ::sigfillset(&all);
   ::pthread_sigmask(SIG_SETMASK, &all, &before);
   Server server(options.server);
-  Streams streams(session, server);
-  StateCollector collector(session, options.socket_path);
-  Pages pages(streams, collector);
-  FoxgloveClients foxglove(DSSM_TRY(session.daemon_info()).host, streams, collector,
-                           std::move(clock));
+  Streams streams(source, server);
+  std::optional<StateCollector> collector;
+  if (session) collector.emplace(*session, options.socket_path);
+  const auto want_all = [&] {
+    if (collector) collector->want_all();
+  };
+  Pages pages(streams, want_all);
+  FoxgloveClients foxglove(shown, streams, want_all, std::move(played));
+  const auto on_state = [&](const VehicleState& state) {
+    foxglove.on_state(state);
+    pages.on_state(state);
+  };
   Worker scrapes;
 
   server.serve_websocket("dssm.view.v1", [&](Peer& peer) { return pages.connect(peer); });
   for (const char* name : {"foxglove.sdk.v1", "foxglove.websocket.v1"}) {
     server.serve_websocket(name, [&](Peer& peer) { return foxglove.connect(peer); });
   }
-  server.serve_text("/metrics", "application/openmetrics-text; version=1.0.0; charset=utf-8",
-                    [&](const Server::Answer& answer) {
-                      scrapes.add([&, answer] { answer(ctl::metrics_text(session)); });
-                    });
+  if (session) {
+    server.serve_text("/metrics", "application/openmetrics-text; version=1.0.0; charset=utf-8",
+                      [&](const Server::Answer& answer) {
+                        scrapes.add([&, answer] { answer(ctl::metrics_text(*session)); });
+                      });
+  }
   server.repeat(FoxgloveClients::kSendPeriod, [&] { foxglove.send_samples(); });
   server.repeat(kClosePeriod, [&] { streams.close_unused(); });
+  if (recorded) server.repeat(kStatePeriod, [&] { on_state(*recorded); });
   const std::uint16_t port = DSSM_TRY(server.listen());
-  collector.start([&](const VehicleState& state) {
-    server.post([&, state] {
-      foxglove.on_state(state);
-      pages.on_state(state);
-    });
-  });
+  if (session) {
+    collector->start(
+        [&](const VehicleState& state) { server.post([&, state] { on_state(state); }); });
+  } else {
+    server.post([&] { on_state(*recorded); });
+  }
 
   running_server = &server;
   struct sigaction action {};
@@ -140,7 +168,7 @@ int main_program(int argc, char** argv) {
   server.pages = DSSM_VIEW_PAGES;
   CLI::App app(
       "Shows the streams of all hosts in a web browser and to Foxglove, and their figures to "
-      "Prometheus (/metrics).",
+      "Prometheus (/metrics). Or shows a recording (--open).",
       "dssm-view");
   // What is on the command line comes after the file.
   app.option_defaults()->multi_option_policy(CLI::MultiOptionPolicy::TakeLast);
@@ -152,6 +180,9 @@ int main_program(int argc, char** argv) {
                  "dssmd's socket (default: $DSSM_SOCKET, else "
                  "/run/dssm/dssmd.sock)")
       ->type_name("PATH");
+  app.add_option("--open", options.recording,
+                 "Show this recording, or the ones in this folder; no dssmd is needed")
+      ->type_name("FILE");
   app.add_option("--certificate", server.certificate, "TLS: this server's certificate (PEM)")
       ->type_name("FILE");
   app.add_option("--key", server.key, "TLS: its private key (PEM)")->type_name("FILE");

@@ -114,7 +114,7 @@ Result<Message> type_answer(Streams& streams, std::uint32_t id, const Json& requ
   const Streams::Found found = streams.find(text_of(request, "stream"));
   Json json = {{"id", id}, {"stream", text_of(request, "stream")}};
   if (found.stream) {
-    const TypeInfo& type = found.stream->reader.type();
+    const TypeInfo& type = found.stream->type();
     TypeInfo readable = type;
     readable.fields = found.stream->fields;
     json["status"] = "ok";
@@ -163,15 +163,19 @@ Result<Message> signals_answer(Streams& streams, std::uint32_t id, const Json& r
   }
   Time to = wanted_to.value_or(Time()), from = wanted_from.value_or(Time());
   if (span) {
-    SampleInfo newest;
-    if (stream.reader.read_info(stream.reader.newest_tid(), newest) == ReadStatus::ok) {
-      to = newest.time;
-    }
+    const auto find_newest = [&](const auto& reader) {
+      SampleInfo newest;
+      if (reader.read_info(reader.newest_tid(), newest) == ReadStatus::ok) to = newest.time;
+    };
+    std::visit(find_newest, stream.reader);
     from = ctl::saturating_add(to, -span->time_since_epoch());
   }
   head["from_ns"] = time_json(from);
   head["to_ns"] = time_json(to);
-  SignalRange range = read_signals(stream.reader, fields, from, to, points->get<std::size_t>());
+  const auto read = [&](auto& reader) {
+    return read_signals(reader, fields, from, to, points->get<std::size_t>());
+  };
+  SignalRange range = std::visit(read, stream.reader);
   if (range.status == ReadStatus::restarted) {
     stream.follow_restart();
     range = {};
@@ -206,23 +210,32 @@ struct Part {
   SampleInfo info;
 };
 
+template <class Reader, class Sample>
+JointRead read_joint(const std::vector<Part*>& parts, Time t) {
+  std::vector<Sample> samples;
+  samples.reserve(parts.size());
+  for (Part* part : parts) {
+    Reader& reader = std::get<Reader>(part->stream->reader);
+    part->payload.resize(reader.payload_bytes());
+    samples.push_back({&reader, part->payload, {}});
+  }
+  const JointRead read = read_joint_at(t, samples);
+  for (std::size_t i = 0; i < parts.size(); ++i) parts[i]->info = samples[i].info;
+  return read;
+}
+
 // Reads all of `parts` at `t` together. One that has no sample then is left out, with its status,
 // and the others are read again.
 void read_together(std::vector<Part*> parts, Time t) {
   while (!parts.empty()) {
-    std::vector<JointSample> samples;
-    for (Part* part : parts) {
-      part->payload.resize(part->stream->reader.payload_bytes());
-      samples.push_back({&part->stream->reader, part->payload, {}});
-    }
-    const JointRead read = read_joint_at(t, samples);
+    const bool is_live = std::holds_alternative<RawReader>(parts.front()->stream->reader);
+    const JointRead read = is_live ? read_joint<RawReader, JointSample>(parts, t)
+                                   : read_joint<RecordedRawReader, RecordedJointSample>(parts, t);
     if (read.status == ReadStatus::ok) {
-      for (std::size_t i = 0; i < parts.size(); ++i) {
-        parts[i]->status = read.status;
-        parts[i]->info = samples[i].info;
-      }
+      for (Part* part : parts) part->status = read.status;
       return;
     }
+    if (read.status == ReadStatus::restarted && !is_live) continue;
     Part* const failed = parts[read.index];
     failed->status = read.status;
     if (read.status == ReadStatus::restarted) failed->stream->follow_restart();
@@ -231,9 +244,15 @@ void read_together(std::vector<Part*> parts, Time t) {
 }
 
 void read_newest(Part& part) {
-  RawReader& reader = part.stream->reader;
-  part.payload.resize(reader.payload_bytes());
-  part.status = reader.read_newest(part.payload, part.info);
+  const auto read = [&](auto& reader) {
+    part.payload.resize(reader.payload_bytes());
+    return reader.read_newest(part.payload, part.info);
+  };
+  if (auto* const recorded = std::get_if<RecordedRawReader>(&part.stream->reader)) {
+    part.status = past_restarts([&] { return read(*recorded); });
+    return;
+  }
+  part.status = read(std::get<RawReader>(part.stream->reader));
   if (part.status == ReadStatus::restarted) part.stream->follow_restart();
 }
 
@@ -247,7 +266,7 @@ Result<Message> at_answer(Streams& streams, std::uint32_t id, const Json& reques
   for (const std::string& name : names) {
     const Streams::Found found = streams.find(name);
     parts.push_back({name, found.stream, found.error, {}, ReadStatus::not_yet, {}});
-    if (found.stream) bytes += found.stream->reader.payload_bytes();
+    if (found.stream) bytes += found.stream->type().payload_bytes;
   }
   if (bytes > kMaxPayloadBytes) {
     return bad_request(
@@ -273,7 +292,8 @@ Result<Message> at_answer(Streams& streams, std::uint32_t id, const Json& reques
       json["status"] = name_of(part.status);
     }
     if (part.stream && part.status == ReadStatus::ok) {
-      const Duration error = part.stream->reader.clock_error(part.info);
+      const Duration error = std::visit(
+          [&](const auto& reader) { return reader.clock_error(part.info); }, part.stream->reader);
       json["tid"] = part.info.tid;
       json["time_ns"] = time_json(part.info.time);
       json["clock_error_ns"] =
@@ -317,7 +337,7 @@ class PageConnection : public Connection {
     const std::string op = text_of(request, "op");
     if (op == "overview") {
       waiting_for_state_.push_back(number);
-      pages_.collector_.want_all();
+      pages_.want_all_();
       return send_state();
     }
     Result<Message> answer = op == "type"      ? type_answer(pages_.streams_, number, request)

@@ -6,9 +6,11 @@
 #pragma once
 
 #include <cstdint>
+#include <functional>
 #include <memory>
 #include <set>
 #include <string>
+#include <utility>
 
 #include "client/view/server.hpp"
 #include "client/view/state.hpp"
@@ -21,8 +23,10 @@ class PageConnection;
 // All pages that are open. In the server's thread.
 class Pages {
  public:
-  // Both outlive it.
-  Pages(Streams& streams, StateCollector& collector) : streams_(streams), collector_(collector) {}
+  // `streams` outlives it.
+  //   want_all  called when a page asks for a state: the next ones are to have all
+  Pages(Streams& streams, std::function<void()> want_all)
+      : streams_(streams), want_all_(std::move(want_all)) {}
 
   std::unique_ptr<Connection> connect(Peer& peer);
 
@@ -32,7 +36,7 @@ class Pages {
  private:
   friend class PageConnection;
   Streams& streams_;
-  StateCollector& collector_;
+  const std::function<void()> want_all_;
   std::string state_;  // the newest as JSON; empty: there is none with all that pages show
   std::uint64_t state_number_ = 0;
   std::set<PageConnection*> connections_;

@@ -477,8 +477,12 @@ bool Server::on_websocket(lws* connection, int reason, WebSocket*& socket, void*
         socket->peer.close("a message is larger than 64 KiB");
       } else if (lws_is_final_fragment(connection) &&
                  lws_remaining_packet_payload(connection) == 0) {
-        const std::string text = std::exchange(socket->received, {});
-        if (!lws_frame_is_binary(connection)) socket->connection->on_text(text);
+        const std::string message = std::exchange(socket->received, {});
+        if (lws_frame_is_binary(connection)) {
+          socket->connection->on_binary(message);
+        } else {
+          socket->connection->on_text(message);
+        }
       }
       return true;
     case LWS_CALLBACK_SERVER_WRITEABLE:

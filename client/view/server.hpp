@@ -76,6 +76,7 @@ class Connection {
   Connection& operator=(const Connection&) = delete;
   virtual ~Connection() = default;
   virtual void on_text(std::string_view text) = 0;
+  virtual void on_binary(std::string_view /*bytes*/) {}
 };
 
 struct ServerOptions {

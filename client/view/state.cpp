@@ -46,7 +46,89 @@ Json streams_json(const std::vector<StreamInfo>& streams, Json& range) {
   return list;
 }
 
+// The stream of `incarnations`, which are at least one, as the page lists it.
+Json recorded_stream_json(const std::vector<const RecordedStreamInfo*>& incarnations,
+                          const StreamInfo& stream) {
+  std::uint64_t samples = 0, lost_samples = 0;
+  std::optional<Time> first, last;
+  for (const RecordedStreamInfo* one : incarnations) {
+    samples += one->samples;
+    lost_samples += one->lost_samples;
+    if (one->samples == 0) continue;
+    first = std::min(first.value_or(one->first_time), one->first_time);
+    last = std::max(last.value_or(one->last_time), one->last_time);
+  }
+  Json json = ctl::stream_json(stream);
+  json["state"] = "recorded";
+  for (const char* unknown : {"age_ns", "writers", "readers", "remote_writers", "remote_readers"}) {
+    json[unknown] = nullptr;
+  }
+  const double length_s =
+      first ? std::chrono::duration<double>(ctl::saturating_sub(*last, *first)).count() : 0;
+  json["rate_hz"] = length_s > 0 ? Json(static_cast<double>(samples - 1) / length_s) : Json();
+  json["samples"] = samples;
+  json["lost_samples"] = lost_samples;
+  json["oldest_ns"] = first ? time_json(*first) : Json();
+  json["newest_ns"] = last ? time_json(*last) : Json();
+  json["mirror"] = nullptr;
+  return json;
+}
+
 }  // namespace
+
+VehicleState recorded_state(const Recording& recording) {
+  VehicleState state;
+  state.has_all = true;
+  std::map<std::string, std::vector<const RecordedStreamInfo*>> streams;  // by their full names
+  std::optional<Time> first, last;
+  for (const RecordedStreamInfo& stream : recording.streams()) {
+    streams[stream.id.str()].push_back(&stream);
+    if (stream.samples == 0) continue;
+    first = std::min(first.value_or(stream.first_time), stream.first_time);
+    last = std::max(last.value_or(stream.last_time), stream.last_time);
+  }
+  Json& json = state.json;
+  json["streams"] = Json::array();
+  for (const auto& [name, incarnations] : streams) {
+    const RecordedStreamInfo& newest = *incarnations.back();
+    StreamInfo stream;
+    stream.id = newest.id;
+    stream.type = newest.type;
+    stream.incarnation = newest.incarnation;
+    stream.depth = newest.depth;
+    stream.cycle = newest.cycle;
+    stream.oldest = newest.first_tid;
+    stream.newest = newest.last_tid;
+    stream.newest_time = newest.last_time;
+    json["streams"].push_back(recorded_stream_json(incarnations, stream));
+    state.streams.push_back(std::move(stream));
+  }
+  json["range"] =
+      first ? Json{{"oldest_ns", time_json(*first)}, {"newest_ns", time_json(*last)}} : Json();
+  json["recording"] = Json::array();
+  for (const std::filesystem::path& file : recording.files()) {
+    json["recording"].push_back(ctl::escaped(file.filename().string()));
+  }
+  state.host = json["recording"].empty() ? "" : json["recording"][0].get<std::string>();
+  json["host"] = state.host;
+  json["version"] = DSSM_VERSION;
+  json["hosts"] = json["nodes"] = json["events"] = Json::array();
+  for (const RecordedTrigger& trigger : recording.triggers()) {
+    json["events"].push_back(
+        {{"number", json["events"].size() + 1},
+         {"time_ns", time_json(trigger.time)},
+         {"severity", "warn"},
+         {"text", fmt::format("{} on {}{}{}", trigger.name, trigger.host,
+                              trigger.reason.empty() ? "" : ": ", trigger.reason)}});
+  }
+  std::vector<ctl::Finding> findings;
+  for (const std::string& warning : recording.warnings()) {
+    findings.push_back({"recording", ctl::Finding::Status::warn, warning});
+  }
+  json["findings"] = ctl::findings_json(findings);
+  json["error"] = "";
+  return state;
+}
 
 void StateCollector::start(std::function<void(const VehicleState&)> on_state) {
   on_state_ = std::move(on_state);

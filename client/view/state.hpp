@@ -2,12 +2,13 @@
 //
 // The state of the vehicle, as dssmd knows it, collected once a second by a thread of its own:
 // hosts and streams always, because from their changes follow the events; programs and doctor's
-// findings only while clients ask for them.
+// findings only while clients ask for them. Or what a recording has of it.
 #pragma once
 
 #include <condition_variable>
 #include <cstdint>
 #include <deque>
+#include <dssm/recording.hpp>
 #include <dssm/session.hpp>
 #include <functional>
 #include <map>
@@ -33,6 +34,9 @@ struct VehicleState {
   bool has_all = false;  // also programs and findings are of now
   ctl::Json json;  // an answer to "overview" of the page's protocol (docs/view.md), without its id
 };
+
+// The one that a recording shows: its streams, its triggers as events, and its warnings as findings.
+VehicleState recorded_state(const Recording& recording);
 
 class StateCollector {
  public:

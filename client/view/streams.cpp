@@ -5,13 +5,17 @@
 #include <utility>
 
 #include "client/dssmctl/fields.hpp"
+#include "core/base/try.hpp"
 
 namespace dssm::view {
 
-OpenStream::OpenStream(RawReader opened)
-    : reader(std::move(opened)), fields(ctl::readable_fields_untrusted(reader.type())) {}
+OpenStream::OpenStream(StreamReader opened) : reader(std::move(opened)) { follow_restart(); }
 
-void OpenStream::follow_restart() { fields = ctl::readable_fields_untrusted(reader.type()); }
+const TypeInfo& OpenStream::type() const {
+  return std::visit([](const auto& any) -> const TypeInfo& { return any.type(); }, reader);
+}
+
+void OpenStream::follow_restart() { fields = ctl::readable_fields_untrusted(type()); }
 
 Streams::Found Streams::find(const std::string& name) {
   if (!entries_.contains(name)) {
@@ -25,7 +29,8 @@ Streams::Found Streams::find(const std::string& name) {
   const MonoTime now = MonoClock::now();
   entry.used = now;
   if (entry.stream) {
-    const std::optional<Error> error = entry.stream->reader.restart_error();
+    const auto* const live = std::get_if<RawReader>(&entry.stream->reader);
+    const std::optional<Error> error = live ? live->restart_error() : std::nullopt;
     if (!error) return {&*entry.stream, {}};
     entry.error = error->message;  // it cannot go on
     entry.stream.reset();
@@ -38,9 +43,13 @@ void Streams::open(const std::string& name) {
   Entry& entry = entries_[name];
   entry.is_opening = true;
   entry.retry_at = deadline_in(kRetryPeriod);
-  const auto result = std::make_shared<Result<RawReader>>(Error{Errc::unavailable, {}});
+  const auto result = std::make_shared<Result<StreamReader>>(Error{Errc::unavailable, {}});
   worker_.add([this, name, result] {
-    *result = session_.open_raw_reader(*StreamId::parse(name));  // find() has tried that
+    // find() has parsed the name.
+    const auto open_in = [&](auto& source) -> Result<StreamReader> {
+      return StreamReader(DSSM_TRY(source.open_raw_reader(*StreamId::parse(name))));
+    };
+    *result = std::visit(open_in, source_);
     server_.post([this, name, result] {
       Entry& opened = entries_[name];
       opened.is_opening = false;

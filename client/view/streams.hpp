@@ -1,15 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The streams that clients ask for: each is open once for all clients, and closed when none asked
-// for it for half a minute. All calls come from the server's thread; opening, which may wait for
-// dssmd or for another host, is done by a worker.
+// The streams that clients ask for, of the vehicle or of a recording: each is open once for all
+// clients, and closed when none asked for it for half a minute. All calls come from the server's
+// thread; opening, which may wait for dssmd or for another host, is done by a worker.
 #pragma once
 
 #include <cstdint>
+#include <dssm/recording.hpp>
 #include <dssm/session.hpp>
 #include <map>
 #include <optional>
 #include <string>
+#include <utility>
+#include <variant>
 #include <vector>
 
 #include "client/view/server.hpp"
@@ -17,21 +20,36 @@
 
 namespace dssm::view {
 
+// What is shown: the vehicle, or a recording.
+using Source = std::variant<Session, Recording>;
+using StreamReader = std::variant<RawReader, RecordedRawReader>;  // of a stream of it
+
 // A stream that is open.
 struct OpenStream {
-  explicit OpenStream(RawReader opened);
+  explicit OpenStream(StreamReader opened);
 
   // To be called when a read returned `restarted`: type and fields may be others now.
   void follow_restart();
 
-  RawReader reader;
+  const TypeInfo& type() const;
+
+  StreamReader reader;
   std::vector<Field> fields;  // readable ones; empty: its payload is not described
 };
+
+// The result of `read`, a read of a recording, which tells once of each change of the incarnation.
+// Here that does not matter: the type stays.
+template <class Read>
+ReadStatus past_restarts(Read read) {
+  ReadStatus status = read();
+  while (status == ReadStatus::restarted) status = read();
+  return status;
+}
 
 class Streams {
  public:
   // `server` outlives it.
-  Streams(Session session, Server& server) : session_(std::move(session)), server_(server) {}
+  Streams(Source source, Server& server) : source_(std::move(source)), server_(server) {}
 
   // The stream of that full name, or nullptr: it is being opened, or could not be. That is tried
   // again with each call, once a second at most.
@@ -58,7 +76,7 @@ class Streams {
   };
   void open(const std::string& name);
 
-  Session session_;
+  Source source_;
   Server& server_;
   std::map<std::string, Entry> entries_;
   Worker worker_;

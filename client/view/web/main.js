@@ -143,7 +143,7 @@ const overviewPump = new Pump(connection, kOverviewMs, async () => {
     oldest: BigInt(overview.range.oldest_ns),
     newest: BigInt(overview.range.newest_ns),
   };
-  time.setRange(range);
+  time.setRange(range, Boolean(overview.recording));
   types.forgetRecreated();
   setText(find("host"), overview.host);
   find("host").title = `dssm-view ${overview.version}`;
@@ -415,13 +415,14 @@ const kKeys = {
   ArrowRight: (event) => step(event.shiftKey ? 10 : 1),
   Home: () => time.range && time.hold(time.range.oldest),
   End: () => time.live(),
+  r: () => time.play(),
   l: () => time.live(),
   p: () => tab === "signals" && signals.addPanel([], true),
   z: () => signals.resetZoom(),
   d: toggleTheme,
   "?": toggleKeys,
 };
-const kOfTime = new Set([" ", "ArrowLeft", "ArrowRight", "Home", "End", "l"]);
+const kOfTime = new Set([" ", "ArrowLeft", "ArrowRight", "Home", "End", "l", "r"]);
 
 document.addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey) return;

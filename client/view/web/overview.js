@@ -6,6 +6,7 @@ import { drawGraph } from "./graph.js";
 
 const kUnknown = "\u2013";
 const kMaxEvents = 200;
+const kNoEvents = "Nothing has happened since dssm-view was started.";
 
 export class Overview {
   // open: called with the name of a stream that was clicked
@@ -20,6 +21,11 @@ export class Overview {
   show(answer) {
     this.answer = answer;
     const limitNs = answer.clock_limit_ns ?? null;
+    const recorded = Boolean(answer.recording);
+    this.find("hosts-group").hidden = recorded;
+    this.find("findings-group").hidden = recorded && answer.findings.length === 0;
+    setText(this.find("findings-title").firstChild, recorded ? "Warnings " : "Doctor ");
+    setText(this.find("no-events"), recorded ? "The recorder waited for no event." : kNoEvents);
     this.showHosts(answer.hosts, limitNs);
     this.showStreams(answer.streams, answer.nodes);
     this.showFindings(answer.findings);
@@ -94,7 +100,13 @@ export class Overview {
       label,
     );
     row.append(
-      element("th", { scope: "row" }, link, element("span", { class: "at" }, `@${stream.host}`)),
+      element(
+        "th",
+        { scope: "row" },
+        link,
+        // A recording may not know it.
+        element("span", { class: "at" }, stream.host ? `@${stream.host}` : ""),
+      ),
     );
     const labels = [
       "State",
@@ -181,8 +193,8 @@ export class Overview {
     const text = JSON.stringify(inGraph);
     if (text === this.graphText) return;
     this.graphText = text;
-    const isEmpty = streams.length + inGraph.nodes.length === 0;
-    this.root.querySelector("#graph-group").hidden = isEmpty;
+    const isEmpty = streams.length + inGraph.nodes.length === 0 || this.answer.recording;
+    this.root.querySelector("#graph-group").hidden = Boolean(isEmpty);
     box.replaceChildren(drawGraph(streams, inGraph.nodes, box.clientWidth));
   }
 }
@@ -277,6 +289,10 @@ function heldText(stream) {
 
 // Only a mirror on this host can lose samples; without one there is nothing to count.
 function lossesOf(stream) {
+  if (stream.lost_samples !== undefined) {
+    const title = `${stream.samples} samples were recorded`;
+    return { text: String(stream.lost_samples), title, bad: stream.lost_samples > 0 };
+  }
   const mirror = stream.mirror;
   if (!mirror) return { text: kUnknown, title: "This host has no mirror of it", bad: false };
   const title =

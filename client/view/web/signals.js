@@ -55,8 +55,10 @@ export class Signals extends EventTarget {
     });
     time.addEventListener("change", () => {
       if (time.hover !== null || time.mode === "live") return this.drawCursor();
+      const { window } = this;
       this.keepInWindow();
-      this.pump.wake();
+      if (time.mode === "play" && window === this.window) this.drawCursor();
+      else this.pump.wake();
     });
     new ResizeObserver(() => this.resize()).observe(this.box);
   }
@@ -401,8 +403,10 @@ export class Signals extends EventTarget {
     const there = this.window && this.window.to - this.window.from === span;
     if (there && t >= this.window.from && t <= this.window.to) return;
     // What was live a moment ago hardly moves; otherwise the instant is near that end.
-    const near = this.window && t > this.window.to && t - this.window.to < span / 10n;
-    const before = there && t < this.window.from ? span / 10n : near ? span : (span * 9n) / 10n;
+    const plays = this.time.mode === "play";
+    const near = !plays && this.window && t > this.window.to && t - this.window.to < span / 10n;
+    const begins = plays || (there && t < this.window.from);
+    const before = begins ? span / 10n : near ? span : (span * 9n) / 10n;
     let from = t - before;
     const oldest = this.time.range?.oldest;
     if (!near && oldest !== undefined && from < oldest && oldest <= t) from = oldest;

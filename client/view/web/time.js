@@ -3,13 +3,16 @@
 // The instant that the page shows: one for all plots and views. Times are BigInt, ns since 1970.
 // Only times of samples are used: those of a recording that is played back are not the present.
 //
-//   live   the newest samples
+//   live   the newest samples; not of a recording
 //   hold   the samples at `t`
+//   play   the same, and `t` goes on, `rate` times as fast as time does, up to the newest sample
 //
 // While the pointer is over a plot, the instant below it is shown instead (`hover`).
 import { setText, timeOfDay, day, duration } from "./format.js";
 
 const kShownPlaces = 3;
+const kPlayMs = 40;
+const kRates = [0.1, 0.5, 1, 2, 5, 10, 50];
 
 // Dispatches "change" when the instant to show has changed, and "mode" when the mode has.
 export class Time extends EventTarget {
@@ -20,6 +23,9 @@ export class Time extends EventTarget {
     this.hover = null;
     this.shown = null; // of the newest answer
     this.range = null; // {oldest, newest}
+    this.recorded = false; // a recording is shown
+    this.rate = 1;
+    this.timer = null; // while playing
   }
 
   // The instant to ask for; null: the newest.
@@ -27,14 +33,18 @@ export class Time extends EventTarget {
     return this.hover ?? this.t;
   }
 
-  // What the rings hold.
-  setRange(range) {
+  // What the rings or the recording hold.
+  setRange(range, recorded) {
     this.range = range;
+    this.recorded = recorded;
+    if (recorded && range && this.mode === "live") this.hold(range.oldest);
     this.dispatchEvent(new Event("range"));
   }
 
+  // Of a recording: its end.
   live() {
-    this.set("live", null);
+    if (this.recorded) this.hold(this.range?.newest ?? null);
+    else this.set("live", null);
   }
 
   // Holds `t`, or what is shown now.
@@ -42,8 +52,27 @@ export class Time extends EventTarget {
     if (t !== null) this.set("hold", t);
   }
 
+  // Goes on from the shown instant; from the oldest when that is the newest.
+  play() {
+    if (!this.range) return;
+    const { oldest, newest } = this.range;
+    const from = this.t ?? this.shown ?? oldest;
+    this.hover = null;
+    this.set("play", from >= newest || from < oldest ? oldest : from);
+    let last = performance.now();
+    clearInterval(this.timer);
+    this.timer = setInterval(() => {
+      const now = performance.now();
+      const t = this.t + BigInt(Math.round((now - last) * 1e6 * this.rate));
+      last = now;
+      if (t >= this.range.newest) this.hold(this.range.newest);
+      else this.set("play", t);
+    }, kPlayMs);
+  }
+
   toggle() {
-    if (this.mode === "live") this.hold();
+    if (this.mode !== "hold") this.hold();
+    else if (this.recorded) this.play();
     else this.live();
   }
 
@@ -60,6 +89,7 @@ export class Time extends EventTarget {
 
   set(mode, t) {
     const changed = mode !== this.mode;
+    if (mode !== "play") clearInterval(this.timer);
     this.mode = mode;
     this.t = t;
     if (changed) this.dispatchEvent(new Event("mode"));
@@ -77,10 +107,16 @@ export class TimeBar {
     this.slider = find("slider");
     this.live = find("live");
     this.hold = find("hold");
+    this.play = find("play");
+    this.rate = find("rate");
     this.oldest = find("oldest");
     this.shown = find("shown-t");
     this.live.addEventListener("click", () => time.live());
     this.hold.addEventListener("click", () => time.hold());
+    this.play.addEventListener("click", () => time.play());
+    for (const rate of kRates) this.rate.add(new Option(`${rate}\u00d7`, rate));
+    this.rate.value = "1";
+    this.rate.addEventListener("change", () => (time.rate = Number(this.rate.value)));
     find("step-back").addEventListener("click", () => step(-1));
     find("step-forward").addEventListener("click", () => step(1));
     this.slider.addEventListener("input", () => {
@@ -99,7 +135,10 @@ export class TimeBar {
     this.root.dataset.mode = time.mode;
     this.root.dataset.tNs = time.t ?? "";
     this.live.setAttribute("aria-pressed", String(time.mode === "live"));
+    this.live.hidden = time.recorded;
     this.hold.setAttribute("aria-pressed", String(time.mode === "hold"));
+    this.play.setAttribute("aria-pressed", String(time.mode === "play"));
+    this.play.disabled = !time.range;
     this.slider.disabled = !time.range;
     if (time.range) this.updateSlider();
     const shown = time.shown;
@@ -123,6 +162,7 @@ export class TimeBar {
     this.slider.setAttribute("aria-valuetext", timeOfDay(t));
     const length = duration(end - oldest);
     setText(this.oldest, `\u2212${length}`);
-    this.oldest.title = `The rings hold samples from ${timeOfDay(oldest)} to ${timeOfDay(newest)}`;
+    const holder = this.time.recorded ? "The recording holds" : "The rings hold";
+    this.oldest.title = `${holder} samples from ${timeOfDay(oldest)} to ${timeOfDay(newest)}`;
   }
 }

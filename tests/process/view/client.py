@@ -11,6 +11,12 @@
 #                        then code and reason.
 #   client.py hold URL   Subscribes to the first channel of Foxglove's protocol and prints "ready";
 #                        then how many samples come before the first status message, and that.
+#   client.py play URL   Subscribes to all channels of a recording. Sends each line of standard input,
+#                        "play|pause SPEED SEEK_NS", as a command of Foxglove's playback control, and
+#                        prints its answer: "state STATUS TIME [seek COMMAND]". After "pause" waits
+#                        for a sample of each channel, and prints them: "TOPIC TIME". After "play"
+#                        waits for the end, and prints how many came of each that were not before
+#                        SEEK_NS, and whether in the order of times.
 import asyncio
 import json
 import struct
@@ -21,6 +27,8 @@ import websockets
 PAGE = "dssm.view.v1"
 FOXGLOVE = "foxglove.sdk.v1"
 MESSAGE_DATA = 1
+PLAYBACK_CONTROL = 3
+PLAYBACK_STATE = 5
 
 
 def decoded(answer):
@@ -100,5 +108,53 @@ async def hold(url):
                 return
 
 
+async def play(url):
+    async with websockets.connect(url, subprotocols=[FOXGLOVE], max_size=None) as server:
+        topics = {}
+        async def receive():
+            message = await server.recv()
+            return message if isinstance(message, bytes) else json.loads(message)
+        info = await receive()
+        assert "playbackControl" in info["capabilities"]
+        begin, end = ("{sec}.{nsec:09}".format(**info[key]) for key in ["dataStartTime", "dataEndTime"])
+        print("from", begin, "to", end)
+        channels = (await receive())["channels"]
+        for channel in channels:
+            topics[channel["id"]] = channel["topic"]
+        subscriptions = [{"id": number, "channelId": number} for number in topics]
+        await server.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
+        for number, line in enumerate(sys.stdin):
+            command, speed, seek_ns = line.split()
+            request_id = str(number).encode()
+            await server.send(struct.pack("<BBfBQI", PLAYBACK_CONTROL, command == "pause",
+                                          float(speed), 1, int(seek_ns), len(request_id)) + request_id)
+            answered = False
+            samples = {topic: [] for topic in topics.values()}
+            while True:
+                message = await receive()
+                if not isinstance(message, bytes):
+                    continue
+                if message[0] == PLAYBACK_STATE:
+                    status, time, speed, did_seek, id_bytes = struct.unpack_from("<BQfBI", message, 1)
+                    answer = message[1 + 18 :].decode()
+                    assert len(answer) == id_bytes
+                    name = ["playing", "paused", "buffering", "ended"][status]
+                    print("state", name, time, *(["seek", answer] if did_seek else []))
+                    answered = answered or answer == str(number)
+                    if name == "ended":
+                        break
+                elif message[0] == MESSAGE_DATA and answered:
+                    channel, time = struct.unpack_from("<IQ", message, 1)
+                    samples[topics[channel]].append(time)
+                if command == "pause" and answered and all(samples.values()):
+                    break
+            for topic, times in sorted(samples.items()):
+                if command == "pause":
+                    print(topic, times[0])
+                    continue
+                times = [time for time in times if time >= int(seek_ns)]
+                print("played", topic, len(set(times)), "in order" if times == sorted(times) else "wild")
+
+
 if __name__ == "__main__":
-    asyncio.run({"ask": ask, "send": send, "hold": hold}[sys.argv[1]](sys.argv[2]))
+    asyncio.run({"ask": ask, "send": send, "hold": hold, "play": play}[sys.argv[1]](sys.argv[2]))

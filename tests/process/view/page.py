@@ -322,8 +322,35 @@ def phone(page, stream):
     assert page.run("return document.documentElement.scrollWidth") <= PHONE[0]
 
 
+def recording(page, stream, oldest_ns, newest_ns):
+    """A recording with `stream` begins held at its first sample, and plays to its last one."""
+    page.open("overview")
+    row = page.wait(stream, lambda: page.one(stream_row(stream)))
+    assert "recorded" in row.text, row.text
+    for group in ["#hosts-group", "#graph-group"]:
+        assert not page.one(group).is_displayed(), "a recording has no hosts and programs"
+    assert "it touched something" in page.one("#events").text
+    page.shot("recording-overview")
+    page.open("signals", signals={"span": 10, "panels": [[[stream, "x_m"]]]})
+    page.wait("the first sample", lambda: page.get("#time", "data-t-ns") == oldest_ns)
+    assert not page.one("#live").is_displayed()
+    page.run("const rate = document.querySelector('#rate');"
+             "rate.value = '10'; rate.dispatchEvent(new Event('change'))")
+    page.press("r")
+    page.wait("it plays", lambda: page.get("#time", "data-mode") == "play")
+    page.wait("it goes on", lambda: int(page.get("#time", "data-t-ns")) > int(oldest_ns) + 10**9)
+    page.press(" ")
+    held = page.wait("it is held", lambda: page.get("#time", "data-mode") == "hold"
+                     and page.get("#time", "data-t-ns"))
+    assert int(oldest_ns) < int(held) < int(newest_ns), held
+    page.shot("recording-signals")
+    page.press(" ")
+    page.wait("its end", lambda: page.get("#time", "data-mode") == "hold"
+              and page.get("#time", "data-t-ns") == newest_ns)
+
+
 CHECKS = {check.__name__: check for check in
-          [overview, signal, slider, link, views, drive, host_down, reconnect, phone]}
+          [overview, signal, slider, link, views, drive, host_down, reconnect, phone, recording]}
 
 
 def main(check, url, folder, *arguments):

@@ -27,6 +27,18 @@ inline std::vector<std::string> view_argv(std::vector<std::string> words) {
   return argv;
 }
 
+// What client.py prints for dssm-view at `url` (http://...), line by line; `lines` are its input.
+inline std::vector<std::string> run_client(const std::string& url, const std::string& what,
+                                           const std::vector<std::string>& lines) {
+  std::string input;
+  for (const std::string& line : lines) input += line + "\n";
+  const Finished finished =
+      run({"/usr/bin/python3", source("tests/process/view/client.py"), what, "ws" + url.substr(4)},
+          {}, input);
+  EXPECT_EQ(finished.exit_status, 0) << finished.err;
+  return lines_of(finished.out);
+}
+
 struct Motion {
   double x;
   float speed[3];

@@ -17,15 +17,8 @@ class View : public ViewTest {
  protected:
   std::string websocket_url() const { return "ws" + url_.substr(4); }
 
-  // What client.py prints, line by line.
   std::vector<std::string> client(const std::string& what, const std::vector<std::string>& lines) {
-    std::string input;
-    for (const std::string& line : lines) input += line + "\n";
-    const Finished finished =
-        run({"/usr/bin/python3", source("tests/process/view/client.py"), what, websocket_url()}, {},
-            input);
-    EXPECT_EQ(finished.exit_status, 0) << finished.err;
-    return lines_of(finished.out);
+    return run_client(url_, what, lines);
   }
   Json ask(const Json& request) {
     const std::vector<std::string> answers = client("ask", {request.dump()});
