@@ -16,7 +16,7 @@ namespace {
 
 // Of everything that is issued; see certificates.hpp.
 constexpr std::time_t kBeginning = 0;
-constexpr const char* kNever = "99991231235959Z";  // RFC 5280 4.1.2.5: no end
+constexpr const char* kNoExpiry = "99991231235959Z";  // RFC 5280 4.1.2.5: no end
 
 // 127 bits, the first one set: always 16 bytes, positive, and 126 of the bits are random.
 constexpr int kSerialBits = 127;
@@ -177,7 +177,7 @@ Result<RevocationList> make_list(const Authority& authority, const RevocationLis
   X509_CRL* crl = list.get();
   const X509* ca = authority.certificate.get();
   bool done = list && beginning && never && number &&
-              ASN1_TIME_set_string(never.get(), kNever) == 1 &&
+              ASN1_TIME_set_string(never.get(), kNoExpiry) == 1 &&
               X509_CRL_set_version(crl, X509_CRL_VERSION_2) == 1 &&
               X509_CRL_set_issuer_name(crl, X509_get_subject_name(ca)) == 1 &&
               X509_CRL_set1_lastUpdate(crl, beginning.get()) == 1 &&

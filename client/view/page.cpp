@@ -24,11 +24,11 @@ using ctl::Json;
 
 constexpr std::size_t kMaxUnanswered = 16;
 constexpr std::size_t kMaxStreams = 64;  // of one request
-constexpr std::size_t kMaxFields = 64;
+constexpr std::size_t kMaxAskedFields = 64;
 constexpr std::uint64_t kMaxPoints = 20'000;
-constexpr std::uint64_t kMaxAllPoints = 400'000;       // of all fields of one request
-constexpr std::uint64_t kMaxPayloadBytes = 32U << 20;  // of one answer
-constexpr std::size_t kAlignment = 8;                  // of data in an answer
+constexpr std::uint64_t kMaxAllPoints = 400'000;      // of all fields of one request
+constexpr std::uint64_t kMaxAnswerBytes = 32U << 20;  // of one answer
+constexpr std::size_t kAlignment = 8;                 // of data in an answer
 
 Error bad_request(std::string text) { return {Errc::invalid_argument, std::move(text)}; }
 
@@ -128,7 +128,7 @@ Result<Message> type_answer(Streams& streams, std::uint32_t id, const Json& requ
 }
 
 Result<Message> signals_answer(Streams& streams, std::uint32_t id, const Json& request) {
-  const std::vector<std::string> names = DSSM_TRY(texts_of(request, "fields", kMaxFields));
+  const std::vector<std::string> names = DSSM_TRY(texts_of(request, "fields", kMaxAskedFields));
   const std::optional<Time> wanted_from = DSSM_TRY(time_of(request, "from_ns"));
   const std::optional<Time> wanted_to = DSSM_TRY(time_of(request, "to_ns"));
   const std::optional<Time> span = DSSM_TRY(time_of(request, "span_ns"));
@@ -268,11 +268,11 @@ Result<Message> at_answer(Streams& streams, std::uint32_t id, const Json& reques
     parts.push_back({name, found.stream, found.error, {}, ReadStatus::not_yet, {}});
     if (found.stream) bytes += found.stream->type().payload_bytes;
   }
-  if (bytes > kMaxPayloadBytes) {
+  if (bytes > kMaxAnswerBytes) {
     return bad_request(
         fmt::format("samples of these streams may have {} bytes together; at most {} are "
                     "sent at once",
-                    bytes, kMaxPayloadBytes));
+                    bytes, kMaxAnswerBytes));
   }
   std::vector<Part*> open;
   for (Part& part : parts) {
@@ -330,7 +330,7 @@ class PageConnection : public Connection {
     if (peer_.waiting() + waiting_for_state_.size() >= kMaxUnanswered) {
       return peer_.close("too many requests at once");
     }
-    if (peer_.waiting_bytes() > kMaxPayloadBytes) {
+    if (peer_.waiting_bytes() > kMaxAnswerBytes) {
       return peer_.close("answers are to be read before more is asked");
     }
     const auto number = id->get<std::uint32_t>();

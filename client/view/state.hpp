@@ -35,7 +35,7 @@ struct VehicleState {
   ctl::Json json;  // an answer to "overview" of the page's protocol (docs/view.md), without its id
 };
 
-// The one that a recording shows: its streams, its triggers as events, and its warnings as findings.
+// The one that a recording shows: its streams, its triggers as events, its warnings as findings.
 VehicleState recorded_state(const Recording& recording);
 
 class StateCollector {

@@ -12,7 +12,7 @@
 namespace dssm::daemon {
 namespace {
 
-constexpr std::size_t kMaxNameBytes = 63;
+constexpr std::size_t kMaxDriverNameBytes = 63;
 
 Result<clock::PlaybackRun> run_untrusted(const proto::PlaybackRun& message) {
   for (const double number : {message.offset_s(), message.speed(), message.paused_at_s()}) {
@@ -88,7 +88,7 @@ Result<void> PlaybackClockOwner::renew(const proto::FollowPlayback& request,
                  "its playback clock follows " + in_quotes(driver_name_) + "; end that first"};
   }
   driver_ = request.ends() ? 0 : request.driver();
-  driver_name_ = name.substr(0, kMaxNameBytes);
+  driver_name_ = name.substr(0, kMaxDriverNameBytes);
   lease_end_ = now + kLease;
   if (on_lease_) on_lease_();
   return {};

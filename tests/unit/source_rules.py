@@ -12,6 +12,8 @@
 #   x.cpp the comment may be in x.hpp.
 # * A ruler is one line: "// --- words". No comment is longer than MAX_LINE columns (clang-format
 #   leaves comments alone, because it breaks tables).
+# * No constant of a source file has the name of one of the public headers: it would hide that from
+#   the sources that are compiled with it at once.
 # * A path of the sources in README.md or a document of docs/, and the target of a link, exists.
 import glob
 import os
@@ -161,6 +163,21 @@ def comment_errors(root):
             yield f"{path}: {len(lines)} lines, and no comment at the top says what they do"
 
 
+def hiding_errors(root):
+    def constants(path, pattern):
+        with open(os.path.join(root, path), encoding="utf-8") as file:
+            return [name for line in re.findall(pattern, file.read(), re.M)
+                    for name in re.findall(r"\b(k[A-Z]\w*)\b(?=\s*[={])", line)]
+
+    public = {name: path for path in sources(root, ("core/include", "client/include"))
+              for name in constants(path, r"^inline constexpr .*$")}
+    for path in sorted(sources(root, ("core", "client", "daemon"))):
+        if path.endswith(".cpp"):
+            for name in constants(path, r"^constexpr .*$"):
+                if name in public:
+                    yield f"{path}: {name} hides the one of {public[name]}; give it another name"
+
+
 def include_errors(root):
     rank = {name: number for number, names in enumerate(ORDER) for name in names}
     graph = {}
@@ -209,7 +226,8 @@ def document_errors(root):
 
 
 def main(root):
-    errors = [*include_errors(root), *comment_errors(root), *document_errors(root)]
+    errors = [*include_errors(root), *hiding_errors(root), *comment_errors(root),
+              *document_errors(root)]
     for error in errors:
         print(error)
     return 1 if errors else 0
