@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""dssmd.service, dssmd.socket and dssm-record.service under a real systemd."""
+"""dssmd.service, dssmd.socket, dssm-record.service and dssm-view.service under a real systemd."""
 
 import pathlib
 import socket
@@ -73,6 +73,7 @@ class ServiceTests:
             ("a mistake in the configuration stops service and socket", self.mistake),
             ("the recorder records incidents, also after a restart of dssmd", self.record),
             ("a mistake in the recorder's configuration stops it", self.record_mistake),
+            ("the view serves page and metrics on this PC only, as its own user", self.view),
             ("after a boot dssmd runs, and its socket was started first", self.boot),
             ("removing dssmd leaves neither service nor socket", self.remove),
         ]
@@ -203,6 +204,26 @@ class ServiceTests:
         assert self.show("dssm-record.service", "ExecMainStatus") == "2"
         file.write_text(right)
         self.container.run("systemctl", "disable", "dssm-record")
+
+    def get(self, url: str) -> str:
+        """What a server answers in the container; empty: nothing."""
+        program = "import sys, urllib.request as web; print(web.urlopen(sys.argv[1]).read().decode())"
+        done = self.container.attempt("python3", "-c", program, url)
+        return done.stdout if done.returncode == 0 else ""
+
+    def view(self) -> None:
+        """Test."""
+        assert self.show("dssm-view.service", "UnitFileState") == "disabled"
+        assert self.show("dssm-view.service", "ActiveState") == "inactive"
+        self.container.run("systemctl", "start", "dssm-view")
+        wait_until(lambda: "dssm_host_up" in self.get("http://127.0.0.1:8765/metrics"),
+                   "there are no metrics")
+        assert "<title>" in self.get("http://127.0.0.1:8765/")
+        assert not self.get("http://10.77.0.2:8765/"), "it listens at other addresses, too"
+        pid = self.show("dssm-view.service", "MainPID")
+        assert self.container.run("stat", "--format=%U %G", f"/proc/{pid}") == "dssm-view dssm"
+        self.container.run("systemctl", "stop", "dssm-view")
+        assert self.show("dssm-view.service", "Result") == "success"
 
     def boot(self) -> None:
         """Test."""
