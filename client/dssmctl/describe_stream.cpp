@@ -179,6 +179,10 @@ std::optional<ProgramType> obvious_type_of_programs(Session& session, const Stre
   return *std::move(type);
 }
 
+const TypeInfo& type_to_show(const TypeInfo& own, const TypeInfo& obvious) {
+  return own.fields.empty() && own.payload_bytes == obvious.payload_bytes ? obvious : own;
+}
+
 Result<void> run(const DescribeOptions& options, Output& out) {
   Session session = DSSM_TRY(connect(options));
   if (options.stream.empty()) return describe_all(session, options, out);

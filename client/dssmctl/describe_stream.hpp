@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The type of a stream whose programs do not describe it, from the debug information of those
-// programs: for `dssmctl describe`, and for what `echo` shows.
+// programs: for `dssmctl describe`, and for what `echo` and dssm-view show.
 #pragma once
 
 #include <dssm/session.hpp>
@@ -28,5 +28,9 @@ Result<ProgramType> type_of_programs(Session& session, const StreamInfo& stream,
 // type or because it is the T of an SSMApi<T, P>, and only of programs whose files are root's or
 // the user's own.
 std::optional<ProgramType> obvious_type_of_programs(Session& session, const StreamId& id);
+
+// What to show of a stream as it is now: its own type, or `obvious`, the type of its programs, if it
+// is not described and that fits.
+const TypeInfo& type_to_show(const TypeInfo& own, const TypeInfo& obvious);
 
 }  // namespace dssm::ctl

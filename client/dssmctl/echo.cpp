@@ -27,11 +27,9 @@ SampleForm form_of(const EchoOptions& options) {
 // `obvious`, the type that its programs have.
 Result<std::vector<Field>> wanted_fields(const RawReader& reader, const TypeInfo& obvious,
                                          const EchoOptions& options) {
-  const TypeInfo& own = reader.type();
-  const bool is_obvious = own.fields.empty() && own.payload_bytes == obvious.payload_bytes;
-  return DSSM_TRY(
-      select_fields(readable_fields_untrusted(is_obvious ? obvious : own), options.fields),
-      fmt::format("show '{}'", reader.id().str()));
+  return DSSM_TRY(select_fields(readable_fields_untrusted(type_to_show(reader.type(), obvious)),
+                                options.fields),
+                  fmt::format("show '{}'", reader.id().str()));
 }
 
 // Of a stream that is not described: the type that its programs have, if there is no doubt.

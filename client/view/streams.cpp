@@ -4,18 +4,24 @@
 #include <memory>
 #include <utility>
 
+#include "client/dssmctl/describe_stream.hpp"
 #include "client/dssmctl/fields.hpp"
 #include "core/base/try.hpp"
 
 namespace dssm::view {
 
-OpenStream::OpenStream(StreamReader opened) : reader(std::move(opened)) { follow_restart(); }
+OpenStream::OpenStream(StreamReader opened, TypeInfo program_type)
+    : reader(std::move(opened)), obvious(std::move(program_type)) {
+  follow_restart();
+}
 
 const TypeInfo& OpenStream::type() const {
   return std::visit([](const auto& any) -> const TypeInfo& { return any.type(); }, reader);
 }
 
-void OpenStream::follow_restart() { fields = ctl::readable_fields_untrusted(type()); }
+void OpenStream::follow_restart() {
+  fields = ctl::readable_fields_untrusted(ctl::type_to_show(type(), obvious));
+}
 
 Streams::Found Streams::find(const std::string& name) {
   if (!entries_.contains(name)) {
@@ -43,13 +49,9 @@ void Streams::open(const std::string& name) {
   Entry& entry = entries_[name];
   entry.is_opening = true;
   entry.retry_at = deadline_in(kRetryPeriod);
-  const auto result = std::make_shared<Result<StreamReader>>(Error{Errc::unavailable, {}});
+  const auto result = std::make_shared<Result<OpenStream>>(Error{Errc::unavailable, {}});
   worker_.add([this, name, result] {
-    // find() has parsed the name.
-    const auto open_in = [&](auto& source) -> Result<StreamReader> {
-      return StreamReader(DSSM_TRY(source.open_raw_reader(*StreamId::parse(name))));
-    };
-    *result = std::visit(open_in, source_);
+    *result = open_in_source(*StreamId::parse(name));  // find() has tried that
     server_.post([this, name, result] {
       Entry& opened = entries_[name];
       opened.is_opening = false;
@@ -61,6 +63,15 @@ void Streams::open(const std::string& name) {
       }
     });
   });
+}
+
+Result<OpenStream> Streams::open_in_source(const StreamId& id) {
+  auto* const session = std::get_if<Session>(&source_);
+  if (!session) return OpenStream(DSSM_TRY(std::get<Recording>(source_).open_raw_reader(id)));
+  RawReader reader = DSSM_TRY(session->open_raw_reader(id));
+  std::optional<ctl::ProgramType> program;
+  if (reader.type().fields.empty()) program = ctl::obvious_type_of_programs(*session, reader.id());
+  return OpenStream(std::move(reader), program ? std::move(program->found.type) : TypeInfo());
 }
 
 void Streams::close_unused() {

@@ -26,7 +26,8 @@ using StreamReader = std::variant<RawReader, RecordedRawReader>;  // of a stream
 
 // A stream that is open.
 struct OpenStream {
-  explicit OpenStream(StreamReader opened);
+  //   program_type  of the programs that have it open, if it is not described
+  explicit OpenStream(StreamReader opened, TypeInfo program_type = {});
 
   // To be called when a read returned `restarted`: type and fields may be others now.
   void follow_restart();
@@ -34,6 +35,7 @@ struct OpenStream {
   const TypeInfo& type() const;
 
   StreamReader reader;
+  TypeInfo obvious;
   std::vector<Field> fields;  // readable ones; empty: its payload is not described
 };
 
@@ -75,6 +77,7 @@ class Streams {
     MonoTime used{};
   };
   void open(const std::string& name);
+  Result<OpenStream> open_in_source(const StreamId& id);  // the worker's
 
   Source source_;
   Server& server_;
