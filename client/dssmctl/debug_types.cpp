@@ -41,7 +41,7 @@ namespace {
 
 constexpr std::uint64_t kMaxEntries = 1U << 26;  // of a file; some seconds
 constexpr std::uint64_t kMaxSteps = 1U << 20;    // to list the fields of a type
-constexpr int kMaxNesting = 32;
+constexpr int kMaxTypeNesting = 32;
 constexpr int kMaxQualifiers = 64;  // typedefs of typedefs
 constexpr std::size_t kMaxCandidates = 4096;
 constexpr std::size_t kMaxLeftOut = 100;
@@ -133,7 +133,7 @@ std::optional<std::uint64_t> elements(Dwarf_Die& array, std::uint64_t& steps) {
 std::optional<std::uint64_t> size_of(const std::optional<Dwarf_Die>& type, std::uint64_t& steps,
                                      int depth = 0) {
   std::optional<Dwarf_Die> die = peeled(type);
-  if (!die || depth > kMaxNesting) return std::nullopt;
+  if (!die || depth > kMaxTypeNesting) return std::nullopt;
   std::optional<std::uint64_t> bytes;
   if (::dwarf_tag(&*die) == DW_TAG_array_type) {
     const auto count = elements(*die, steps);
@@ -236,7 +236,7 @@ class FieldLister {
            std::uint64_t offset, int depth) {
     std::optional<Dwarf_Die> die = peeled(type);
     if (!die) return leave_out(name, "its type is not in the debug information");
-    if (steps_ == 0 || depth > kMaxNesting) return leave_out(name, "nested too deeply");
+    if (steps_ == 0 || depth > kMaxTypeNesting) return leave_out(name, "nested too deeply");
     --steps_;
     const std::uint64_t bytes = number(*die, DW_AT_byte_size).value_or(0);
     switch (::dwarf_tag(&*die)) {
@@ -442,7 +442,7 @@ class TypeFinder {
   std::map<const void*, Candidate> candidates;
 
   void walk(Dwarf_Die& parent, const std::string& scope, int depth) {
-    if (depth > kMaxNesting) return;
+    if (depth > kMaxTypeNesting) return;
     for_each_child(parent, steps_, [&](Dwarf_Die& child) {
       const int tag = ::dwarf_tag(&child);
       switch (tag) {

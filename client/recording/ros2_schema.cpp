@@ -16,7 +16,7 @@ namespace dssm::recording {
 namespace {
 
 constexpr std::uint64_t kMaxAlignment = 8;  // of CDR
-constexpr int kMaxNesting = 16;             // of nested types; deeper ones are bytes
+constexpr int kMaxTypeNesting = 16;         // of nested types; deeper ones are bytes
 
 char upper(char c) { return c >= 'a' && c <= 'z' ? static_cast<char>(c - 'a' + 'A') : c; }
 char lower(char c) { return c >= 'A' && c <= 'Z' ? static_cast<char>(c - 'A' + 'a') : c; }
@@ -228,8 +228,8 @@ class Generator {
     } else {
       count = 1;
     }
-    if (depth == kMaxNesting || base < out.cursor || end > limit || base + count * bytes > limit ||
-        (is_array && element_end - base > bytes)) {
+    if (depth == kMaxTypeNesting || base < out.cursor || end > limit ||
+        base + count * bytes > limit || (is_array && element_end - base > bytes)) {
       out.pad_to(group.front().offset);
       out.add_bytes(end, name);
       return;
