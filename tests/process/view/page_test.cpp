@@ -161,6 +161,14 @@ TEST_F(ViewPage, ShowsTheDriveOfTheExample) {
   };
   Running localizer({built(programs + "localizer")}, {daemon_.environment()});
   Running encoder = replay("encoder", daemon_), lidar = replay("lidar", pc2_);
+  // Of a program of SSM, which describes nothing: the fields are in its debug information.
+  Json odometry;
+  await([&] {
+    const auto answers = run_client(url_, "ask", {R"({"op":"type","stream":"odometry@pc1"})"});
+    odometry = answers.size() == 1 ? Json::parse(answers[0]) : Json::object();
+    return odometry.value("status", "") == "ok";
+  });
+  EXPECT_TRUE(contains(odometry.dump(), "theta_rad")) << odometry;
   expect_ok("drive", {"lidar:0@pc2", "pose:0@pc1"});
 }
 
