@@ -29,8 +29,8 @@ Result<ProgramType> type_of_programs(Session& session, const StreamInfo& stream,
 // the user's own.
 std::optional<ProgramType> obvious_type_of_programs(Session& session, const StreamId& id);
 
-// What to show of a stream as it is now: its own type, or `obvious`, the type of its programs, if it
-// is not described and that fits.
+// What to show of a stream as it is now: its own type, or `obvious`, that of its programs, if it is
+// not described and that fits.
 const TypeInfo& type_to_show(const TypeInfo& own, const TypeInfo& obvious);
 
 }  // namespace dssm::ctl

