@@ -185,6 +185,7 @@ def slider(page, *streams):
         return [page.get(card(stream), "data-tid") for stream in streams]
 
     page.wait("samples", lambda: all(tids()))
+    page.wait("what the rings hold", lambda: page.get("#time", "data-oldest-ns"))
     for part in [0.3, 0.55, 0.8, 0.9]:
         place, held = page.run(
             "const slider = document.getElementById('slider');"
