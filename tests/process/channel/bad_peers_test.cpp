@@ -167,7 +167,10 @@ TEST_F(BadPeer, ThatNeverReadsStaysWithinItsHostsMemoryAndDelaysNoOther) {
     reader.open("fast");
     ASSERT_TRUE(reader.ask(subscribe_from_oldest_frame()).has_subscribed());
     for (Tid tid = 0; tid < 2000; ++tid) {
-      if (tid % 20 == 0) camera.write();
+      if (tid % 20 == 0) {
+        camera.write();
+        ASSERT_TRUE(good_.ask(list_frame()).has_stream_list());
+      }
       fast.write();
       std::optional<net::Frame> frame = reader.try_receive();
       while (frame && !frame->has_sample()) frame = reader.try_receive();
