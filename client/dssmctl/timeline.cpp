@@ -104,13 +104,15 @@ bool Timeline::has_jumped() {
   if (!clock_) return false;
   const Setting before = known_;
   const double before_s = known_real_s_;
-  known_ = clock_->setting();
+  // Before the setting is read: a change after that moment is found at the next call.
   known_real_s_ = seconds_of(WallClock::now());
+  known_ = clock_->setting();
+  const double now_s = seconds_of(WallClock::now());
   // It was changed at some moment in between, from what it was to what it is.
-  const double began = at(before, before_s), would_be = at(before, known_real_s_);
+  const double began = at(before, before_s), would_be = at(before, now_s);
   const double speed = known_.paused ? 0 : known_.speed;
-  const double as_of_now = began + speed * (known_real_s_ - before_s);
-  const double is = at(known_, known_real_s_);
+  const double as_of_now = began + speed * (now_s - before_s);
+  const double is = at(known_, now_s);
   constexpr double kToleranceSeconds = 1e-3;
   const auto [least, greatest] = std::minmax({began, would_be, as_of_now});
   return is < least - kToleranceSeconds || is > greatest + kToleranceSeconds;

@@ -88,8 +88,8 @@ class Timeline {
 
   std::optional<PlaybackClock> clock_;
   const Duration lead_;
-  // Of clock_, at the last has_jumped() or since the last change of ours, and when that was. What
-  // another program has changed since then is still to be found.
+  // Of clock_, at the last has_jumped() or since the last change of ours, and a moment just before
+  // that. What another program has changed since then is still to be found.
   Setting known_;
   double known_real_s_ = 0;
   // Without clock_: at that real time it was so late.
