@@ -159,7 +159,10 @@ Result<void> run(const RecordOptions& options, Output& out) {
   Session session = DSSM_TRY(connect(options));
   RecordingOptions how;
   how.compression = compression_of(options.compression);
-  RecorderPlan plan{StreamFilter(options.hosts, options.patterns), options.types, options.past,
+  RecorderPlan plan{StreamFilter(options.hosts, options.patterns),
+                    options.types,
+                    options.past,
+                    {},
                     options.black_box};
   plan.keep_removed = std::max(plan.keep_removed, options.before);
   if (options.black_box) return run_black_box(options, std::move(session), plan, how, out);

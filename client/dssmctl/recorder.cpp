@@ -95,6 +95,7 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
       std::any_of(wanted_.begin(), wanted_.end(), is_it)) {
     return;
   }
+  if (plan_.range && !is_beginning_) return;
   untried_ += is_beginning_;
   wanted_.push_back({event.stream, MonoClock::now(), is_beginning_, false});
   changed_.notify_one();
@@ -222,7 +223,8 @@ void Recorder::Opener::run() {
 
 Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
   // A stream that comes later is new, or its host is: all of it is wanted.
-  const bool with_history = plan_.past || plan_.on_demand || !wanted.from_start;
+  const bool with_history =
+      plan_.past || plan_.range || plan_.on_demand || !wanted.from_start;
   Session session = session_;
   // Before there is a reader: what is set from then on is reported, with the sample. Empty when
   // there is none, or its host does not answer.
@@ -230,7 +232,7 @@ Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
   RawReader reader = DSSM_TRY(
       session.open_raw_reader(wanted.stream.id, nullptr, 0,
                               with_history ? FetchHistory::at_once : FetchHistory::when_read));
-  Source source{std::move(reader), 0, kNoTid, kNoTid, {}, true, {}, {}};
+  Source source{std::move(reader), 0, kNoTid, kNoTid, {}, {}, true, {}, {}};
   if (property) source.property = *std::move(property);
   const Tid newest = source.reader.newest_tid();
   // The stamps of a recording that is being played are of another time than now.
@@ -247,6 +249,10 @@ Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
     source.reader.seek(kNoTid);
     source.past_until = newest;
     if (plan_.past && wanted.from_start) source.from = past_of(source, started_, *plan_.past);
+    if (plan_.range) {
+      source.from = plan_.range->first;
+      source.until = plan_.range->last;
+    }
   }
   return source;
 }
@@ -276,7 +282,7 @@ bool Recorder::Opener::has_tried_all() const {
 Result<std::unique_ptr<Recorder>> Recorder::start(Session session,
                                                   std::optional<RecordingWriter> file,
                                                   const RecorderPlan& plan) {
-  const MonoTime all_by = plan.past ? deadline_in(kOpeningTime) : MonoTime();
+  const MonoTime all_by = plan.past || plan.range ? deadline_in(kOpeningTime) : MonoTime();
   std::unique_ptr<Recorder> recorder(new Recorder(std::move(session), std::move(file), plan));
   recorder->all_by_ = all_by;
   DSSM_TRY(recorder->opener_.begin());
@@ -511,7 +517,7 @@ Result<bool> Recorder::take(Source& source, std::optional<Time> until) {
     if (status != ReadStatus::ok) break;
     bytes += payload_.size();
     ++samples;
-    if (source.from && info.time < *source.from) {
+    if ((source.from && info.time < *source.from) || (source.until && info.time > *source.until)) {
       source.next = info.tid + 1;
       continue;
     }

@@ -34,6 +34,11 @@ struct RecorderPlan {
   std::vector<std::string> types;  // shell patterns, one of which its type's name fits; empty: all
   // From so long before now: what the rings hold still. Empty: from now on.
   std::optional<Duration> past;
+  // Instead of `past`: samples of these times only, first and last included, by their stamps.
+  struct Range {
+    Time first, last;
+  };
+  std::optional<Range> range;
   // Nothing is recorded before begin(); until then streams are only kept open, with what their
   // rings hold, also of other hosts.
   bool on_demand = false;
@@ -72,7 +77,7 @@ class Recorder {
   // When take() is to be called again.
   MonoTime next_take() const { return next_take_; }
 
-  // Whether there is nothing more of the past to come, of `plan.past` or begin(): all streams that
+  // Whether there is nothing more of the past to come, of the plan or of begin(): all streams that
   // there were are recorded up to their newest sample of then, or could not be opened.
   bool has_past() const;
   // Whether nothing of it came for so long that another host must be slow or silent.
@@ -129,7 +134,7 @@ class Recorder {
     std::uint32_t number = 0;  // in the file
     Tid next = kNoTid;  // what was before it is recorded, or known as lost; kNoTid: not known yet
     Tid past_until = kNoTid;          // the newest at its opening, if history is wanted
-    std::optional<Time> from;         // samples before that are not wanted
+    std::optional<Time> from, until;  // samples before and after these are not wanted
     bool is_of_now = true;            // its stamps are of this time, and not of one that is played
     std::vector<std::byte> property;  // that the file has, or gets at its beginning
     std::vector<NewProperty> new_properties;  // the file has not yet

@@ -24,6 +24,7 @@
 #include "client/dssmctl/text.hpp"
 #include "client/view/foxglove.hpp"
 #include "client/view/page.hpp"
+#include "client/view/saver.hpp"
 #include "client/view/server.hpp"
 #include "client/view/state.hpp"
 #include "client/view/streams.hpp"
@@ -113,7 +114,9 @@ Result<void> serve(Options options) {
   const auto want_all = [&] {
     if (collector) collector->want_all();
   };
-  Pages pages(streams, want_all);
+  std::optional<Saver> saver;
+  if (session) saver.emplace(*session, server);
+  Pages pages(streams, saver ? &*saver : nullptr, want_all);
   FoxgloveClients foxglove(shown, streams, want_all, std::move(played));
   const auto on_state = [&](const VehicleState& state) {
     foxglove.on_state(state);

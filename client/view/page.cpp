@@ -24,6 +24,7 @@ using ctl::Json;
 
 constexpr std::size_t kMaxUnanswered = 16;
 constexpr std::size_t kMaxStreams = 64;  // of one request
+constexpr std::size_t kMaxSavedStreams = 1024;
 constexpr std::size_t kMaxAskedFields = 64;
 constexpr std::uint64_t kMaxPoints = 20'000;
 constexpr std::uint64_t kMaxAllPoints = 400'000;      // of all fields of one request
@@ -307,18 +308,50 @@ Result<Message> at_answer(Streams& streams, std::uint32_t id, const Json& reques
   return answer.message(head);
 }
 
+Result<WantedRange> wanted_range(const Json& request) {
+  WantedRange range;
+  if (request.contains("streams")) {
+    range.streams = DSSM_TRY(texts_of(request, "streams", kMaxSavedStreams));
+  }
+  const std::optional<Time> from = DSSM_TRY(time_of(request, "from_ns"));
+  const std::optional<Time> to = DSSM_TRY(time_of(request, "to_ns"));
+  if (!from || (to && *from >= *to)) {
+    return bad_request("'from_ns' is needed, and is to be before 'to_ns'");
+  }
+  range.first = *from;
+  range.last = to.value_or(Time::max());
+  return range;
+}
+
+Message saved_answer(std::uint32_t id, const SavedRange& saved) {
+  return Message::text(ctl::json_text({{"id", id},
+                                       {"path", saved.path},
+                                       {"streams", saved.streams},
+                                       {"samples", saved.progress.samples},
+                                       {"lost_samples", saved.progress.lost_samples},
+                                       {"file_bytes", saved.progress.file_bytes},
+                                       {"notices", saved.notices}}));
+}
+
+Message property_answer(std::uint32_t id, const std::vector<std::byte>& property) {
+  DataAnswer answer(id);
+  const std::uint64_t at = answer.add(property);
+  return answer.message({{"property_bytes", property.size()}, {"property_at", at}});
+}
+
 }  // namespace
 
 // --- a page
 
 class PageConnection : public Connection {
  public:
-  PageConnection(Pages& pages, Peer& peer) : pages_(pages), peer_(peer) {
-    pages_.connections_.insert(this);
+  PageConnection(Pages& pages, Peer& peer)
+      : pages_(pages), peer_(peer), number_(++pages.last_connection_) {
+    pages_.connections_[number_] = this;
   }
   PageConnection(const PageConnection&) = delete;
   PageConnection& operator=(const PageConnection&) = delete;
-  ~PageConnection() override { pages_.connections_.erase(this); }
+  ~PageConnection() override { pages_.connections_.erase(number_); }
 
   void on_text(std::string_view text) override {
     const Json request = Json::parse(text, nullptr, false);
@@ -327,7 +360,7 @@ class PageConnection : public Connection {
         id->get<std::uint64_t>() > std::numeric_limits<std::uint32_t>::max()) {
       return peer_.close("a request is to be a JSON object with a number 'id'");
     }
-    if (peer_.waiting() + waiting_for_state_.size() >= kMaxUnanswered) {
+    if (peer_.waiting() + waiting_for_state_.size() + answers_under_way_ >= kMaxUnanswered) {
       return peer_.close("too many requests at once");
     }
     if (peer_.waiting_bytes() > kMaxAnswerBytes) {
@@ -340,15 +373,18 @@ class PageConnection : public Connection {
       pages_.want_all_();
       return send_state();
     }
-    Result<Message> answer = op == "type"      ? type_answer(pages_.streams_, number, request)
-                             : op == "signals" ? signals_answer(pages_.streams_, number, request)
-                             : op == "at"
-                                 ? at_answer(pages_.streams_, number, request)
-                                 : bad_request(fmt::format("there is no operation '{}'", op));
-    if (!answer) {
-      answer = Message::text(ctl::json_text({{"id", number}, {"error", answer.error().message}}));
+    if (op == "save" || op == "property") {
+      const Result<void> asked =
+          op == "save" ? ask_to_save(number, request) : ask_property(number, request);
+      if (!asked) send(number, asked.error());
+      return;
     }
-    peer_.send(*std::move(answer));
+    const Result<Message> answer =
+        op == "type"      ? type_answer(pages_.streams_, number, request)
+        : op == "signals" ? signals_answer(pages_.streams_, number, request)
+        : op == "at"      ? at_answer(pages_.streams_, number, request)
+                          : bad_request(fmt::format("there is no operation '{}'", op));
+    send(number, answer);
   }
 
   // Answers requests for a state that this page has not had.
@@ -364,8 +400,47 @@ class PageConnection : public Connection {
   }
 
  private:
+  void send(std::uint32_t id, const Result<Message>& answer) {
+    peer_.send(
+        answer ? *answer
+               : Message::text(ctl::json_text({{"id", id}, {"error", answer.error().message}})));
+  }
+
+  // To be called with the answer, later. The page may be closed by then.
+  std::function<void(const Result<Message>&)> answer_later(std::uint32_t id) {
+    ++answers_under_way_;
+    return [&pages = pages_, page = number_, id](const Result<Message>& answer) {
+      const auto found = pages.connections_.find(page);
+      if (found == pages.connections_.end()) return;
+      --found->second->answers_under_way_;
+      found->second->send(id, answer);
+    };
+  }
+
+  Result<void> ask_to_save(std::uint32_t id, const Json& request) {
+    WantedRange range = DSSM_TRY(wanted_range(request));
+    if (!pages_.saver_) return bad_request("a recording is shown, which is saved already");
+    pages_.saver_->save(std::move(range),
+                        [answer = answer_later(id), id](const Result<SavedRange>& saved) {
+                          answer(saved ? Result<Message>(saved_answer(id, *saved)) : saved.error());
+                        });
+    return {};
+  }
+
+  Result<void> ask_property(std::uint32_t id, const Json& request) {
+    const std::optional<Time> t = DSSM_TRY(time_of(request, "t_ns"));
+    pages_.streams_.ask_property(
+        text_of(request, "stream"), t,
+        [answer = answer_later(id), id](const Result<std::vector<std::byte>>& property) {
+          answer(property ? Result<Message>(property_answer(id, *property)) : property.error());
+        });
+    return {};
+  }
+
   Pages& pages_;
   Peer& peer_;
+  const std::uint64_t number_;
+  std::size_t answers_under_way_ = 0;
   std::vector<std::uint32_t> waiting_for_state_;
   std::uint64_t state_number_ = 0;  // that it has
 };
@@ -378,7 +453,7 @@ void Pages::on_state(const VehicleState& state) {
   // One without programs and findings is not for pages: their next request asks for all.
   state_ = state.has_all ? ctl::json_text(state.json) : "";
   ++state_number_;
-  for (PageConnection* connection : connections_) connection->send_state();
+  for (const auto& [number, connection] : connections_) connection->send_state();
 }
 
 }  // namespace dssm::view

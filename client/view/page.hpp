@@ -7,11 +7,12 @@
 
 #include <cstdint>
 #include <functional>
+#include <map>
 #include <memory>
-#include <set>
 #include <string>
 #include <utility>
 
+#include "client/view/saver.hpp"
 #include "client/view/server.hpp"
 #include "client/view/state.hpp"
 #include "client/view/streams.hpp"
@@ -23,10 +24,11 @@ class PageConnection;
 // All pages that are open. In the server's thread.
 class Pages {
  public:
-  // `streams` outlives it.
+  // `streams` and `saver` outlive it.
+  //   saver     null: ranges cannot be saved
   //   want_all  called when a page asks for a state: the next ones are to have all
-  Pages(Streams& streams, std::function<void()> want_all)
-      : streams_(streams), want_all_(std::move(want_all)) {}
+  Pages(Streams& streams, Saver* saver, std::function<void()> want_all)
+      : streams_(streams), saver_(saver), want_all_(std::move(want_all)) {}
 
   std::unique_ptr<Connection> connect(Peer& peer);
 
@@ -36,10 +38,12 @@ class Pages {
  private:
   friend class PageConnection;
   Streams& streams_;
+  Saver* const saver_;
   const std::function<void()> want_all_;
   std::string state_;  // the newest as JSON; empty: there is none with all that pages show
   std::uint64_t state_number_ = 0;
-  std::set<PageConnection*> connections_;
+  std::map<std::uint64_t, PageConnection*> connections_;  // by their numbers
+  std::uint64_t last_connection_ = 0;
 };
 
 }  // namespace dssm::view

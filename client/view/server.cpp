@@ -141,9 +141,9 @@ void Peer::close(std::string_view reason) {
 
 struct Server::Library {
   std::vector<lws_protocols> protocols;
-  std::string pages, address, certificate, key, authority;
-  lws_http_mount files{};
-  std::vector<lws_http_mount> texts;
+  std::string root = "/", pages, address, certificate, key, authority;
+  std::vector<lws_http_mount> mounts;                     // the last one has the pages
+  std::vector<lws_protocol_vhost_options> content_types;  // of folders
   std::array<lws_protocol_vhost_options, 5> headers{};
 };
 
@@ -199,23 +199,30 @@ Result<std::uint16_t> Server::listen() {
   Library& library = *library_;
   library.pages = options_.pages.string();
   library.address = options_.address;
-  library.files.mountpoint = "/";
-  library.files.mountpoint_len = 1;
-  library.files.origin = library.pages.c_str();
-  library.files.origin_protocol = LWSMPRO_FILE;
-  library.files.def = "index.html";
-
-  for (const auto& [path, text] : texts_) {
+  const auto mount_at = [](const std::string& path, lws_mount_protocols origin) {
     lws_http_mount mount{};
-    mount.mount_next = library.texts.empty() ? &library.files : nullptr;
     mount.mountpoint = path.c_str();
     mount.mountpoint_len = static_cast<unsigned char>(path.size());
-    mount.origin_protocol = LWSMPRO_CALLBACK;
-    mount.protocol = "http";
-    library.texts.push_back(mount);
+    mount.origin_protocol = static_cast<unsigned char>(origin);
+    return mount;
+  };
+  for (const auto& [path, text] : texts_) {
+    library.mounts.push_back(mount_at(path, LWSMPRO_CALLBACK));
+    library.mounts.back().protocol = "http";
   }
-  for (std::size_t i = 1; i < library.texts.size(); ++i) {
-    library.texts[i].mount_next = &library.texts[i - 1];
+  library.content_types.reserve(folders_.size());
+  for (const Folder& folder : folders_) {
+    library.content_types.push_back(
+        {nullptr, nullptr, folder.suffix.c_str(), folder.content_type.c_str()});
+    library.mounts.push_back(mount_at(folder.path, LWSMPRO_FILE));
+    library.mounts.back().origin = folder.folder.c_str();
+    library.mounts.back().extra_mimetypes = &library.content_types.back();
+  }
+  library.mounts.push_back(mount_at(library.root, LWSMPRO_FILE));
+  library.mounts.back().origin = library.pages.c_str();
+  library.mounts.back().def = "index.html";
+  for (std::size_t i = 1; i < library.mounts.size(); ++i) {
+    library.mounts[i - 1].mount_next = &library.mounts[i];
   }
 
   // Also against what the page itself may be made to do by a name that it shows.
@@ -248,7 +255,7 @@ Result<std::uint16_t> Server::listen() {
   const bool is_any = library.address == "0.0.0.0" || library.address == "::";
   info.iface = is_any ? nullptr : library.address.c_str();
   info.protocols = library.protocols.data();
-  info.mounts = library.texts.empty() ? &library.files : &library.texts.back();
+  info.mounts = library.mounts.data();
   info.headers = &library.headers.back();
   info.user = this;
   info.options = LWS_SERVER_OPTION_FAIL_UPON_UNABLE_TO_BIND | LWS_SERVER_OPTION_VALIDATE_UTF8;

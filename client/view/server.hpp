@@ -111,6 +111,12 @@ class Server {
   void serve_text(const std::string& path, std::string content_type,
                   std::function<void(Answer)> make);
 
+  // GET of `path`/FILE is answered by the folder's file, if its name ends with `suffix`.
+  void serve_folder(const std::string& path, std::filesystem::path folder, std::string suffix,
+                    std::string content_type) {
+    folders_.push_back({path, std::move(folder), std::move(suffix), std::move(content_type)});
+  }
+
   // Calls `call` in the thread of run(), each `period`.
   void repeat(Duration period, std::function<void()> call);
 
@@ -134,6 +140,9 @@ class Server {
   struct Text {
     std::string content_type;
     std::function<void(Answer)> make;
+  };
+  struct Folder {
+    std::string path, folder, suffix, content_type;
   };
   // A client that waits for a text.
   struct Request {
@@ -160,6 +169,7 @@ class Server {
   lws_context* context_ = nullptr;
   std::map<std::string, Connect> endpoints_;
   std::map<std::string, Text> texts_;
+  std::vector<Folder> folders_;
   std::map<std::uint64_t, Request> requests_;  // by their numbers, from 1 on
   std::uint64_t last_request_ = 0;
   std::set<std::string> reported_;  // refusals

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "client/view/streams.hpp"
 
+#include <fmt/format.h>
+
 #include <memory>
 #include <utility>
 
@@ -9,6 +11,26 @@
 #include "core/base/try.hpp"
 
 namespace dssm::view {
+namespace {
+
+Result<std::vector<std::byte>> recorded_property(const Recording& recording, const StreamId& id,
+                                                 std::optional<Time> t) {
+  std::optional<std::size_t> stream, index;
+  for (std::size_t i = 0; i < recording.streams().size(); ++i) {
+    const RecordedStreamInfo& one = recording.streams()[i];
+    const bool is_later = stream && t && one.first_time > *t;  // an incarnation
+    if (one.id != id || is_later) continue;
+    stream = i;
+    index.reset();
+    if (!one.property_times.empty()) {
+      index = t ? one.property_at(*t) : one.property_times.size() - 1;
+    }
+  }
+  if (index) return recording.property(*stream, *index);
+  return Error{Errc::not_found, fmt::format("'{}' has no property then", id.str())};
+}
+
+}  // namespace
 
 OpenStream::OpenStream(StreamReader opened, TypeInfo program_type)
     : reader(std::move(opened)), obvious(std::move(program_type)) {
@@ -72,6 +94,17 @@ Result<OpenStream> Streams::open_in_source(const StreamId& id) {
   std::optional<ctl::ProgramType> program;
   if (reader.type().fields.empty()) program = ctl::obvious_type_of_programs(*session, reader.id());
   return OpenStream(std::move(reader), program ? std::move(program->found.type) : TypeInfo());
+}
+
+void Streams::ask_property(const std::string& name, std::optional<Time> t, PropertyDone done) {
+  const Result<StreamId> id = StreamId::parse(name);
+  if (!id) return done(id.error());
+  worker_.add([this, id = *id, t, done = std::move(done)] {
+    auto* const session = std::get_if<Session>(&source_);
+    const Result<std::vector<std::byte>> property =
+        session ? session->property(id) : recorded_property(std::get<Recording>(source_), id, t);
+    server_.post([property, done] { done(property); });
+  });
 }
 
 void Streams::close_unused() {

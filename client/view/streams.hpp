@@ -8,6 +8,7 @@
 #include <cstdint>
 #include <dssm/recording.hpp>
 #include <dssm/session.hpp>
+#include <functional>
 #include <map>
 #include <optional>
 #include <string>
@@ -60,6 +61,13 @@ class Streams {
     std::string error;             // empty: it is being opened
   };
   Found find(const std::string& name);
+
+  // Calls `done`, in this thread, with the property that the stream has; of a recording, had at `t`
+  // (empty: at its end).
+  //   fails  invalid_argument (not a stream's name), not_found (no such stream, or no property), and
+  //          as Session::property() and Recording::property()
+  using PropertyDone = std::function<void(const Result<std::vector<std::byte>>&)>;
+  void ask_property(const std::string& name, std::optional<Time> t, PropertyDone done);
 
   // Closes what was not found for long.
   void close_unused();

@@ -53,20 +53,20 @@ export class Connection extends EventTarget {
     this.connect();
   }
 
-  // Resolves to the JSON answer, or to a BinaryAnswer.
-  request(op, parameters = {}) {
+  // Resolves to the JSON answer, or to a BinaryAnswer. The connection is lost if none comes in time.
+  request(op, parameters = {}, answerMs = kAnswerMs) {
     if (this.state !== "connected") return Promise.reject(new LostError("not connected"));
     // The server ends a connection with too many unanswered requests.
     if (this.waiting.size >= kMaxUnderWay) {
       return new Promise((resolve, reject) => {
-        this.queue.push({ request: () => this.request(op, parameters).then(resolve, reject), reject });
+        this.queue.push({ request: () => this.request(op, parameters, answerMs).then(resolve, reject), reject });
       });
     }
     const id = this.nextId;
     this.nextId = (this.nextId % 0x7fffffff) + 1;
     const socket = this.socket;
     return new Promise((resolve, reject) => {
-      const timer = setTimeout(() => this.lose(socket), kAnswerMs);
+      const timer = setTimeout(() => this.lose(socket), answerMs);
       this.waiting.set(id, { resolve, reject, timer });
       socket.send(JSON.stringify({ id, op, ...parameters }));
     });

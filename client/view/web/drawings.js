@@ -424,6 +424,7 @@ export class TableView {
 
 const kMaxDump = 4096;
 const kBytesInLine = 16;
+const kMaxTextBytes = 65536;
 
 export class HexView {
   constructor(box) {
@@ -446,5 +447,25 @@ export class HexView {
     }
     if (end < payload.byteLength) lines.push(`\u2026 ${payload.byteLength - end} more bytes`);
     setText(this.text, lines.join("\n"));
+  }
+}
+
+// A property has no type: a text is shown as one.
+export class PropertyView extends HexView {
+  show({ payload }) {
+    const text = plainText(payload);
+    if (text === null) super.show({ payload });
+    else setText(this.text, text);
+  }
+}
+
+// Null if it is not a text.
+function plainText(payload) {
+  if (payload.byteLength === 0 || payload.byteLength > kMaxTextBytes) return null;
+  try {
+    const text = new TextDecoder("utf-8", { fatal: true }).decode(payload);
+    return /[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]/.test(text) ? null : text;
+  } catch {
+    return null;
   }
 }

@@ -77,6 +77,11 @@ export function bytes(count) {
   return `${digits(count / 1024 ** 2)} MiB`;
 }
 
+// "1 sample", "2 samples"
+export function counted(count, noun) {
+  return `${count} ${noun}${count === 1 ? "" : "s"}`;
+}
+
 export function rate(hz) {
   return `${hz >= 100 ? hz.toFixed(0) : hz.toFixed(1)} Hz`;
 }

@@ -5,6 +5,7 @@
 import { Connection, LostError, Pump, RequestError } from "./connection.js";
 import { setText, timeOfDay } from "./format.js";
 import { Overview } from "./overview.js";
+import { SaveDialog } from "./save.js";
 import { Signals } from "./signals.js";
 import { Time, TimeBar } from "./time.js";
 import { Views } from "./views.js";
@@ -95,7 +96,8 @@ const overviewPage = new Overview(find("overview"), (stream) => {
   views.changed();
   showTab("views");
 });
-new TimeBar(find("time"), time, step);
+const saveDialog = new SaveDialog(find("save-dialog"), { connection, time, signals, page });
+new TimeBar(find("time"), time, { step, save: () => saveDialog.open() });
 
 const kTabs = ["overview", "signals", "views"];
 let tab = "overview";
@@ -418,6 +420,7 @@ const kKeys = {
   r: () => time.play(),
   l: () => time.live(),
   p: () => tab === "signals" && signals.addPanel([], true),
+  s: () => saveDialog.open(),
   z: () => signals.resetZoom(),
   d: toggleTheme,
   "?": toggleKeys,

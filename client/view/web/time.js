@@ -99,8 +99,8 @@ export class Time extends EventTarget {
 
 // The bar at the bottom of the page.
 export class TimeBar {
-  // step: called with -1 or 1 by the buttons
-  constructor(root, time, step) {
+  // step: called with -1 or 1 by the buttons; save: by its button
+  constructor(root, time, { step, save }) {
     this.root = root;
     this.time = time;
     const find = (id) => root.querySelector(`#${id}`);
@@ -119,6 +119,8 @@ export class TimeBar {
     this.rate.addEventListener("change", () => (time.rate = Number(this.rate.value)));
     find("step-back").addEventListener("click", () => step(-1));
     find("step-forward").addEventListener("click", () => step(1));
+    this.save = find("save");
+    this.save.addEventListener("click", save);
     this.slider.addEventListener("input", () => {
       if (!time.range) return;
       time.hover = null;
@@ -135,7 +137,7 @@ export class TimeBar {
     this.root.dataset.mode = time.mode;
     this.root.dataset.tNs = time.t ?? "";
     this.live.setAttribute("aria-pressed", String(time.mode === "live"));
-    this.live.hidden = time.recorded;
+    this.live.hidden = this.save.hidden = time.recorded;
     this.hold.setAttribute("aria-pressed", String(time.mode === "hold"));
     this.play.setAttribute("aria-pressed", String(time.mode === "play"));
     this.play.disabled = !time.range;

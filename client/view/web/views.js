@@ -5,11 +5,12 @@
 import { Pump, RequestError } from "./connection.js";
 import { guessKind, imageOf, poseOf, scanOf } from "./fields.js";
 import { duration, element, setText, timeOfDay, wholeDuration } from "./format.js";
-import { HexView, ImageView, PlaneView, TableView } from "./drawings.js";
+import { HexView, ImageView, PlaneView, PropertyView, TableView } from "./drawings.js";
 
 const kSuggested = 6; // cards that are shown before a person has chosen
-const kKinds = { scan: "Scan", pose: "Pose", image: "Image", table: "Table", hex: "Hex" };
+const kKinds = { scan: "Scan", pose: "Pose", image: "Image", table: "Table", hex: "Hex", property: "Property" };
 const kTrailPeriodMs = 500;
+const kPropertyPeriodMs = 2000;
 const kOpeningMs = 100;
 const kTrailPoints = 2000;
 const kTrailSpans = [0, 10, 30, 60, 300, 3600]; // seconds
@@ -29,7 +30,7 @@ export class Views extends EventTarget {
       this.adder.value = "";
       this.changed();
     });
-    this.pump = new Pump(connection, kTrailPeriodMs, () => this.askTrails());
+    this.pump = new Pump(connection, kTrailPeriodMs, () => this.askMore());
     time.addEventListener("change", () => time.mode !== "live" && this.pump.wake());
     time.addEventListener("mode", () => this.pump.wake());
   }
@@ -118,10 +119,14 @@ export class Views extends EventTarget {
     for (const card of this.cards) card.drawing?.redraw?.();
   }
 
-  async askTrails() {
+  // What cards show besides the samples of the shown instant.
+  async askMore() {
     if (this.root.hidden) return null;
     let opening = false;
-    for (const card of this.cards) opening = (await card.askTrail()) || opening;
+    for (const card of this.cards) {
+      await card.askProperty();
+      opening = (await card.askTrail()) || opening;
+    }
     if (opening) return kOpeningMs;
     return this.time.mode === "hold" ? null : kTrailPeriodMs;
   }
@@ -135,6 +140,7 @@ class Card {
     this.place = typeof place === "string" ? place : null; // the stream of poses for a scan
     this.trailS = kTrailSpans.includes(trail) ? trail : kDefaultTrail;
     this.trail = null;
+    this.propertyAt = -Infinity; // when it was asked for
     this.drawing = null;
     this.make();
   }
@@ -259,6 +265,7 @@ class Card {
       image: () => new ImageView(this.body, this.type, imageOf(this.type)),
       table: () => new TableView(this.body, this.type),
       hex: () => new HexView(this.body),
+      property: () => new PropertyView(this.body),
     };
     this.body.replaceChildren();
     this.drawing = makers[kind]();
@@ -273,7 +280,7 @@ class Card {
     if (poseOf(this.type)) kinds.push("pose");
     if (imageOf(this.type) || this.isJpeg) kinds.push("image");
     if (this.type.fields.length > 0) kinds.push("table");
-    kinds.push("hex");
+    kinds.push("hex", "property");
     return kinds;
   }
 
@@ -337,6 +344,7 @@ class Card {
 
   draw(sample, samples) {
     const kind = this.shownKind();
+    if (kind === "property") return;
     const note = (text) => setText(this.note, text);
     if (kind === "scan" || kind === "pose") {
       const poseSample = samples.get(this.poseStream());
@@ -376,6 +384,30 @@ class Card {
       foot.error,
       sample.clockErrorNs === null ? "" : `\u00b1${duration(sample.clockErrorNs)}`,
     );
+  }
+
+  // --- the property ------------------------------------------------------------------------------
+
+  async askProperty() {
+    const { time, connection } = this.views;
+    const isNew = time.t !== this.propertyT || performance.now() - this.propertyAt > kPropertyPeriodMs;
+    if (this.shownKind() !== "property" || !this.drawing || !isNew) return;
+    this.propertyAt = performance.now();
+    this.propertyT = time.t;
+    const { drawing } = this;
+    try {
+      const answer = await connection.request("property", {
+        stream: this.stream,
+        t_ns: time.t === null ? null : String(time.t),
+      });
+      if (drawing !== this.drawing) return;
+      const { property_at: at, property_bytes: size } = answer.head;
+      drawing.show({ payload: answer.bytes(at, size) });
+      setText(this.note, "");
+    } catch (error) {
+      if (!(error instanceof RequestError)) throw error;
+      setText(this.note, error.message);
+    }
   }
 
   // --- the trail ---------------------------------------------------------------------------------

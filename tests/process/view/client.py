@@ -50,6 +50,9 @@ def decoded(answer):
         if "payload_at" in sample:
             at = sample.pop("payload_at")
             sample["payload"] = data[at : at + sample["payload_bytes"]].hex()
+    if "property_at" in head:
+        at = head.pop("property_at")
+        head["property"] = data[at : at + head["property_bytes"]].hex()
     return head
 
 

@@ -239,6 +239,24 @@ def link(page, stream, *fields):
     page.wait("the overview", lambda: page.one("#overview").is_displayed())
 
 
+def save(page, stream):
+    """What the rings hold of `stream` is downloaded as a recording; prints its path."""
+    page.open("views", views=[{"stream": stream, "kind": "property"}])
+    page.wait("the property", lambda: page.one(card(stream) + " pre").text == "wheel_m = 0.1")
+    page.driver.execute_cdp_cmd("Browser.setDownloadBehavior", {
+        "behavior": "allow", "downloadPath": page.folder})
+    page.press("s")
+    page.wait("the dialog", lambda: page.one("#save-dialog").is_displayed())
+    page.one("#save-range").send_keys("all that the rings hold")
+    page.one("#save-streams").send_keys("those shown")
+    page.one("#save-now").click()
+    page.wait("it is saved", lambda: "100 samples of 1 stream" in page.one("#save-result").text)
+    name = page.one("#save-result a").text
+    page.wait("it is here", lambda: os.path.exists(os.path.join(page.folder, name)))
+    page.shot("save")
+    say("saved", os.path.join(page.folder, name))
+
+
 def views(page, scan, pose, image, raw):
     """Each type gets the view that fits, and it shows the sample."""
     page.may_report = ["willReadFrequently"]  # this check reads pixels
@@ -351,7 +369,7 @@ def recording(page, stream, oldest_ns, newest_ns):
 
 
 CHECKS = {check.__name__: check for check in
-          [overview, signal, slider, link, views, drive, host_down, reconnect, phone, recording]}
+          [overview, signal, slider, link, save, views, drive, host_down, reconnect, phone, recording]}
 
 
 def main(check, url, folder, *arguments):

@@ -5,6 +5,7 @@
 #include <signal.h>
 
 #include <cmath>
+#include <dssm/recording.hpp>
 #include <filesystem>
 #include <optional>
 
@@ -143,6 +144,22 @@ TEST_F(ViewPage, DrawsScansPosesImagesAndBytes) {
       session_.create_raw({"raw", 0, ""}, TypeInfo{"", some.size(), 1, {}}, depth_of(8)).value();
   raw.write(some);
   expect_ok("views", {"scan:0@pc1", "pose:0@pc1", "camera:0@pc1", "raw:0@pc1"});
+}
+
+TEST_F(ViewPage, SavesARecordingAndShowsAProperty) {
+  auto motion = session_.create<Wheels>("motion", depth_of(101)).value();
+  for (int i = 0; i < 100; ++i) motion.write({0.5 * i, {}, i});
+  constexpr std::string_view kProperty = "wheel_m = 0.1";
+  ASSERT_TRUE(motion.set_property(std::as_bytes(std::span(kProperty))));
+  Running page(page_argv("save", {kMotion}), {});
+  std::string path;
+  for (const std::string& line : lines(page, [] {})) {
+    if (line.starts_with("saved ")) path = line.substr(6);
+  }
+  const Recording recording = Recording::open(path).value();
+  ASSERT_EQ(recording.streams().size(), 1U);
+  EXPECT_EQ(recording.streams()[0].samples, 100U);
+  std::filesystem::remove(path);
 }
 
 // Its first 50 seconds, all of which the rings hold.

@@ -10,6 +10,7 @@
 #include <vector>
 
 #include "tests/process/dssmctl/fleet_test.hpp"
+#include "tests/support/folder.hpp"
 
 namespace dssm::test {
 
@@ -55,7 +56,9 @@ class ViewTest : public FleetTest {
     if (at != std::string::npos) url_ = line.substr(at);
   }
 
-  Running view_{view_argv({"--listen", "127.0.0.1:0"}), environment()};
+  TestFolder temporary_;  // of dssm-view
+  Running view_{view_argv({"--listen", "127.0.0.1:0"}),
+                {daemon_.environment(), "TMPDIR=" + temporary_.path()}};
   std::string url_;  // http://127.0.0.1:PORT/
 };
 

@@ -4,6 +4,8 @@
 // http.client and websockets (client.py), and Foxglove's own library (foxglove/client.cjs).
 #include <signal.h>
 
+#include <dssm/recording.hpp>
+#include <filesystem>
 #include <fstream>
 
 #include "tests/process/view/view_fixture.hpp"
@@ -293,6 +295,75 @@ TEST_F(View, FollowsAStreamThatIsCreatedAgain) {
     const Json sample = ask(request)["samples"][0];
     return sample["status"] == "ok" && sample["tid"] == 0;
   });
+}
+
+// --- what is saved
+
+// A file of the server, at `path` here.
+void download(const std::string& url, const std::string& path) {
+  const Finished finished =
+      run({"/usr/bin/python3", "-c",
+           "import sys, urllib.request as r; r.urlretrieve(*sys.argv[1:])", url, path});
+  EXPECT_EQ(finished.exit_status, 0) << finished.err;
+}
+
+TEST_F(View, SavesARangeAsARecording) {
+  auto motion = session_.create<Motion>("motion", depth_of(101)).value();
+  auto lidar = on_pc2_.create<std::int64_t>("lidar", depth_of(101)).value();
+  const std::vector<std::byte> property = {std::byte{1}, std::byte{2}};
+  ASSERT_TRUE(motion.set_property(property));
+  const Time begin = WallClock::now() - std::chrono::seconds(1);
+  const auto time_of = [&](int i) { return begin + std::chrono::milliseconds(10 * i); };
+  for (int i = 0; i < 100; ++i) {
+    motion.write({0.5 * i, {}, i}, time_of(i));
+    lidar.write(i, time_of(i));
+  }
+  await_streams(1);
+  const auto ns = [&](int i) { return std::to_string(to_ns(time_of(i))); };
+  const Json saved = ask({{"op", "save"}, {"from_ns", ns(20)}, {"to_ns", ns(60)}});
+  EXPECT_EQ(saved["streams"], 2) << saved;
+  EXPECT_EQ(saved["samples"], 82) << saved;
+  EXPECT_EQ(saved["lost_samples"], 0) << saved;
+  EXPECT_TRUE(saved["notices"].empty()) << saved;
+
+  const TestFolder folder;
+  const std::string path = saved.value("path", "");
+  ASSERT_TRUE(path.ends_with(".mcap")) << saved;
+  download(url_ + path.substr(1), folder.file("a.mcap"));
+  EXPECT_EQ(std::filesystem::file_size(folder.file("a.mcap")), saved["file_bytes"]);
+  const Recording recording = Recording::open(folder.file("a.mcap")).value();
+  ASSERT_EQ(recording.streams().size(), 2U);
+  for (const RecordedStreamInfo& stream : recording.streams()) {
+    EXPECT_EQ(stream.samples, 41U) << stream.id.str();
+    EXPECT_EQ(stream.first_time, time_of(20)) << stream.id.str();
+    EXPECT_EQ(stream.last_time, time_of(60)) << stream.id.str();
+    EXPECT_EQ(stream.property, stream.id.name == "motion" ? property : std::vector<std::byte>());
+  }
+
+  // One stream, and all that is there of it.
+  const Json one =
+      ask({{"op", "save"}, {"streams", {"lidar:0@pc2"}}, {"from_ns", "0"}, {"to_ns", nullptr}});
+  EXPECT_EQ(one["streams"], 1) << one;
+  EXPECT_EQ(one["samples"], 100) << one;
+
+  EXPECT_TRUE(contains(ask({{"op", "save"}})["error"].dump(), "'from_ns'"));
+  EXPECT_EQ(get(path.substr(0, path.rfind('/'))).first, 404);
+  EXPECT_EQ(get("/saved/../../../etc/passwd").first, 404);
+  EXPECT_EQ(get("/saved/%2e%2e/%2e%2e/%2e%2e/etc/passwd").first, 404);
+  // The files end with it.
+  EXPECT_FALSE(std::filesystem::is_empty(temporary_.path()));
+  view_.signal(SIGTERM);
+  EXPECT_EQ(view_.status(), 0);
+  EXPECT_TRUE(std::filesystem::is_empty(temporary_.path()));
+}
+
+TEST_F(View, GivesTheProperty) {
+  auto motion = session_.create<Motion>("motion", depth_of(8)).value();
+  const Json request = {{"op", "property"}, {"stream", "motion:0@pc1"}};
+  EXPECT_TRUE(contains(ask(request)["error"].dump(), "no property")) << ask(request);
+  ASSERT_TRUE(motion.set_property(std::vector<std::byte>{std::byte{0x5a}, std::byte{3}}));
+  EXPECT_EQ(ask(request)["property"], "5a03");
+  EXPECT_TRUE(contains(ask({{"op", "property"}, {"stream", "a b:x"}})["error"].dump(), "a b"));
 }
 
 // --- clients that do not read
