@@ -223,8 +223,7 @@ void Recorder::Opener::run() {
 
 Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
   // A stream that comes later is new, or its host is: all of it is wanted.
-  const bool with_history =
-      plan_.past || plan_.range || plan_.on_demand || !wanted.from_start;
+  const bool with_history = plan_.past || plan_.range || plan_.on_demand || !wanted.from_start;
   Session session = session_;
   // Before there is a reader: what is set from then on is reported, with the sample. Empty when
   // there is none, or its host does not answer.

@@ -64,8 +64,8 @@ class Streams {
 
   // Calls `done`, in this thread, with the property that the stream has; of a recording, had at `t`
   // (empty: at its end).
-  //   fails  invalid_argument (not a stream's name), not_found (no such stream, or no property), and
-  //          as Session::property() and Recording::property()
+  //   fails  invalid_argument (not a stream's name), not_found (no such stream, or no property),
+  //          and as Session::property() and Recording::property()
   using PropertyDone = std::function<void(const Result<std::vector<std::byte>>&)>;
   void ask_property(const std::string& name, std::optional<Time> t, PropertyDone done);
 

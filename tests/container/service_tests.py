@@ -222,6 +222,8 @@ class ServiceTests:
         assert not self.get("http://10.77.0.2:8765/"), "it listens at other addresses, too"
         pid = self.show("dssm-view.service", "MainPID")
         assert self.container.run("stat", "--format=%U %G", f"/proc/{pid}") == "dssm-view dssm"
+        saved = self.container.run("find", f"/proc/{pid}/root/var/tmp/", "-name", "dssm-view-*")
+        assert saved, "it has no folder for what pages have saved"
         self.container.run("systemctl", "stop", "dssm-view")
         assert self.show("dssm-view.service", "Result") == "success"
 
