@@ -52,14 +52,19 @@ void put(std::vector<std::byte>& out, Number number) {
 }
 
 // A sample as CDR, as a recording has it but without the trailer.
-void put_sample(std::vector<std::byte>& out, const TypeInfo& type,
-                std::span<const std::byte> payload) {
-  put(out, recording::kCdrHead);
-  if (recording::is_sequence(type)) put(out, static_cast<std::uint32_t>(payload.size()));
-  const std::size_t begin = out.size();
-  out.insert(out.end(), payload.begin(), payload.end());
+Message sample_message(std::uint32_t id, const TypeInfo& type, const SampleInfo& info,
+                       std::span<const std::byte> payload) {
+  std::vector<std::byte> head;
+  head.reserve(32);
+  put(head, kMessageData);
+  put(head, id);
+  put(head, recording::log_time_of(info.time));
+  put(head, recording::kCdrHead);
+  const bool is_sequence = recording::is_sequence(type);
+  if (is_sequence) put(head, static_cast<std::uint32_t>(payload.size()));
   // One that is shorter than its type has zeros in its place.
-  if (!recording::is_sequence(type)) out.resize(begin + type.payload_bytes);
+  const std::vector<std::byte> rest(is_sequence ? 0 : type.payload_bytes - payload.size());
+  return Message::binary({head, payload, rest});
 }
 
 }  // namespace
@@ -329,20 +334,7 @@ class FoxgloveConnection : public Connection {
 
   void send_sample(std::uint32_t id, const FoxgloveClients::Channel& channel,
                    const SampleInfo& info, std::span<const std::byte> payload) {
-    peer_.send(Message::binary({sample_message(id, channel, info, payload)}));
-  }
-
-  static std::vector<std::byte> sample_message(std::uint32_t id,
-                                               const FoxgloveClients::Channel& channel,
-                                               const SampleInfo& info,
-                                               std::span<const std::byte> payload) {
-    std::vector<std::byte> message;
-    message.reserve(payload.size() + 32);
-    put(message, kMessageData);
-    put(message, id);
-    put(message, recording::log_time_of(info.time));
-    put_sample(message, channel.type, payload);
-    return message;
+    peer_.send(sample_message(id, channel.type, info, payload));
   }
 
   void send(const Json& message) { peer_.send(Message::text(ctl::json_text(message))); }
@@ -421,10 +413,9 @@ class FoxgloveConnection : public Connection {
         ++left_out_;
         continue;
       }
-      const std::vector<std::byte> message =
-          sample_message(id, channel->second, sample.info(), sample.payload());
+      Message message = sample_message(id, channel->second.type, sample.info(), sample.payload());
       if (sample.still_valid()) {
-        peer_.send(Message::binary({message}));
+        peer_.send(std::move(message));
       } else {
         ++left_out_;
       }
