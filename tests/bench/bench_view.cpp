@@ -2,9 +2,9 @@
 //
 // dssm-view beside the programs of a vehicle: 100 streams of 64 B at 1 kHz, and three clients: a
 // page that shows curves and samples, Foxglove with all streams, and another one that stands still.
-// How long writes take and how late a waiting reader gets a sample, alone and beside it; dssm-view's
-// processor time and memory. The raw limit is a process that sends as many bytes as the clients
-// got, each 10 ms, by TCP over the loopback interface.
+// How long writes take and how late a waiting reader gets a sample, alone and beside it;
+// dssm-view's processor time and memory. The raw limit is a process that sends as many bytes as the
+// clients got, each 10 ms, by TCP over the loopback interface.
 #include <cinttypes>
 #include <cstring>
 #include <dssm/dssm.hpp>
