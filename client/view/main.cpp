@@ -192,6 +192,9 @@ int main_program(int argc, char** argv) {
   app.add_option("--authority", server.authority,
                  "TLS: clients must have a certificate of this CA (PEM)")
       ->type_name("FILE");
+  app.add_option("--revoked", server.revoked,
+                 "TLS: this list of that CA has the certificates that do not count any more (PEM)")
+      ->type_name("FILE");
   app.add_flag("--insecure", options.insecure,
                "Listen for other PCs without TLS: all who reach the address may read all streams");
   app.add_option("--host", server.hosts, "A further name by which browsers may call this server")
@@ -221,9 +224,12 @@ int main_program(int argc, char** argv) {
     return app.exit(error) == 0 ? kSuccess : kWrongUsage;
   }
   if (server.certificate.empty() != server.key.empty() ||
-      (server.certificate.empty() && !server.authority.empty())) {
-    std::fputs("dssm-view: --certificate and --key belong together, and --authority needs both\n",
-               stderr);
+      (server.certificate.empty() && !server.authority.empty()) ||
+      (server.authority.empty() && !server.revoked.empty())) {
+    std::fputs(
+        "dssm-view: --certificate and --key belong together, --authority needs both, and "
+        "--revoked needs --authority\n",
+        stderr);
     return kWrongUsage;
   }
   const Result<void> served = serve(std::move(options));

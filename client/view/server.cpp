@@ -6,8 +6,10 @@
 #include <libwebsockets.h>
 #include <netinet/in.h>
 #include <netinet/tcp.h>
+#include <openssl/err.h>
 #include <openssl/ssl.h>
 #include <sys/socket.h>
+#include <sys/stat.h>
 #include <unistd.h>
 
 #include <algorithm>
@@ -18,14 +20,16 @@
 #include <utility>
 
 #include "client/dssmctl/text.hpp"
+#include "core/base/try.hpp"
 
 namespace dssm::view {
 namespace {
 
 constexpr std::size_t kMaxRequestBytes = 64U << 10;  // of a WebSocket's message to this server
 constexpr std::size_t kTurnBytes = 256U << 10;  // sent to one client before others have their turn
-constexpr unsigned kMaxDescriptors = 256;       // of connections and files at once
-constexpr std::size_t kMaxReported = 100;       // different reasons for refusals, each once
+constexpr Duration kCredentialsPeriod = std::chrono::seconds(5);
+constexpr unsigned kMaxDescriptors = 256;  // of connections and files at once
+constexpr std::size_t kMaxReported = 100;  // different reasons for refusals, each once
 
 // The value of a request's header; empty: it has none.
 std::string header(lws* connection, lws_token_indexes which) {
@@ -149,6 +153,82 @@ struct Server::Library {
   std::array<lws_protocol_vhost_options, 5> headers{};
 };
 
+// The files of TLS, and what is made of them.
+struct Server::Credentials {
+  explicit Credentials(const ServerOptions& options) : options_(options) {}
+
+  // Whether a file is another one than at the last call, the first one included.
+  bool have_changed() {
+    std::vector<std::pair<ino_t, std::int64_t>> stamps;
+    for (const std::filesystem::path& file :
+         {options_.certificate, options_.key, options_.authority, options_.revoked}) {
+      struct stat status {};
+      ::stat(file.c_str(), &status);
+      stamps.emplace_back(status.st_ino,
+                          status.st_mtim.tv_sec * 1'000'000'000 + status.st_mtim.tv_nsec);
+    }
+    return std::exchange(stamps_, stamps) != stamps;
+  }
+
+  // Checks all, then has `tls` use them, if there is one, for the handshakes from then on.
+  Result<void> load() {
+    const std::unique_ptr<SSL_CTX, Free<SSL_CTX_free>> trial(SSL_CTX_new(TLS_server_method()));
+    DSSM_TRY(load_certificate(trial.get()));
+    std::unique_ptr<X509_STORE, Free<X509_STORE_free>> store(X509_STORE_new());
+    if (!options_.authority.empty() &&
+        X509_STORE_load_file(store.get(), options_.authority.c_str()) != 1) {
+      return failed(options_.authority, "holds no certificate in PEM form");
+    }
+    if (!options_.revoked.empty()) {
+      X509_LOOKUP* const lookup = X509_STORE_add_lookup(store.get(), X509_LOOKUP_file());
+      if (X509_load_crl_file(lookup, options_.revoked.c_str(), X509_FILETYPE_PEM) <= 0) {
+        return failed(options_.revoked, "holds no revocation list in PEM form");
+      }
+      X509_STORE_set_flags(store.get(), X509_V_FLAG_CRL_CHECK | X509_V_FLAG_CRL_CHECK_ALL);
+    }
+    if (!tls) return {};
+    DSSM_TRY(load_certificate(tls));
+    SSL_CTX_set_cert_store(tls, store.release());
+    return {};
+  }
+
+  SSL_CTX* tls = nullptr;  // libwebsockets'
+
+ private:
+  template <auto function>
+  struct Free {
+    template <class T>
+    void operator()(T* object) const {
+      function(object);
+    }
+  };
+
+  static Error failed(const std::filesystem::path& file, std::string_view what) {
+    ERR_clear_error();
+    struct stat status {};
+    if (::stat(file.c_str(), &status) != 0 || ::access(file.c_str(), R_OK) != 0) {
+      return {Errc::system,
+              fmt::format("read '{}': {}", file.string(), std::generic_category().message(errno))};
+    }
+    return {Errc::invalid_argument, fmt::format("'{}' {}", file.string(), what)};
+  }
+
+  Result<void> load_certificate(SSL_CTX* context) const {
+    if (SSL_CTX_use_certificate_chain_file(context, options_.certificate.c_str()) != 1) {
+      return failed(options_.certificate, "holds no certificate in PEM form");
+    }
+    if (SSL_CTX_use_PrivateKey_file(context, options_.key.c_str(), SSL_FILETYPE_PEM) != 1) {
+      return failed(options_.key,
+                    "holds no private key in PEM form, or that of another "
+                    "certificate than --certificate");
+    }
+    return {};
+  }
+
+  const ServerOptions& options_;
+  std::vector<std::pair<ino_t, std::int64_t>> stamps_;
+};
+
 struct Server::Timer {
   lws_sorted_usec_list_t entry{};  // the first: libwebsockets gives its address to run()
   Server* server = nullptr;
@@ -266,14 +346,11 @@ Result<std::uint16_t> Server::listen() {
     info.options |= LWS_SERVER_OPTION_DISABLE_IPV6;
   info.keepalive_timeout = 60;
   info.fd_limit_per_thread = kMaxDescriptors;
-  for (const std::filesystem::path& file :
-       {options_.certificate, options_.key, options_.authority}) {
-    if (!file.empty() && ::access(file.c_str(), R_OK) != 0) {
-      return Error{Errc::system, fmt::format("read '{}': {}", file.string(),
-                                             std::generic_category().message(errno))};
-    }
-  }
   if (!options_.certificate.empty()) {
+    credentials_ = std::make_unique<Credentials>(options_);
+    credentials_->have_changed();
+    DSSM_TRY(credentials_->load());
+    repeat(kCredentialsPeriod, [this] { follow_credentials(); });
     library.certificate = options_.certificate.string();
     library.key = options_.key.string();
     info.options |= LWS_SERVER_OPTION_DO_SSL_GLOBAL_INIT;
@@ -295,6 +372,7 @@ Result<std::uint16_t> Server::listen() {
                     "address of this PC?",
                     options_.address, options_.port, std::generic_category().message(errno))};
   }
+  if (credentials_) DSSM_TRY(credentials_->load());
   const int port = lws_get_vhost_listen_port(lws_get_vhost_by_name(context_, "default"));
   if (!listens_only_at(options_.address, port)) {
     return Error{Errc::system,
@@ -368,6 +446,13 @@ int Server::on_event(lws* connection, int reason, void* user, void* in, std::siz
   // `length`: whether OpenSSL accepts the certificate, which counts for nothing else.
   if (reason == LWS_CALLBACK_OPENSSL_PERFORM_CLIENT_CERT_VERIFICATION) return length != 0 ? 0 : 1;
   auto& server = *static_cast<Server*>(lws_context_user(lws_get_context(connection)));
+  if (reason == LWS_CALLBACK_OPENSSL_LOAD_EXTRA_SERVER_VERIFY_CERTS) {
+    SSL_CTX* const tls = server.credentials_->tls = static_cast<SSL_CTX*>(user);
+    // A resumed session would not be compared with a new list of revoked certificates.
+    SSL_CTX_set_num_tickets(tls, 0);
+    SSL_CTX_set_session_cache_mode(tls, SSL_SESS_CACHE_OFF);
+    return 0;
+  }
   const lws_protocols* protocol = lws_get_protocol(connection);
   if (reason == LWS_CALLBACK_EVENT_WAIT_CANCELLED) {  // comes once for each protocol
     if (protocol == lws_vhost_name_to_protocol(lws_get_vhost(connection), "http")) {
@@ -394,6 +479,20 @@ int Server::on_event(lws* connection, int reason, void* user, void* in, std::siz
           ? server.on_http(connection, reason, *static_cast<std::uint64_t*>(user))
           : server.on_websocket(connection, reason, *static_cast<WebSocket**>(user), in, length);
   return goes_on ? 0 : -1;
+}
+
+void Server::follow_credentials() {
+  if (!credentials_->have_changed()) return;
+  if (const Result<void> loaded = credentials_->load(); !loaded) {
+    std::fputs(fmt::format("dssm-view: the certificates are used as they were: {}\n",
+                           ctl::escaped_message(loaded.error().message))
+                   .c_str(),
+               stderr);
+    return;
+  }
+  std::fputs("dssm-view: the certificates were read again\n", stderr);
+  // Who is there still may be revoked; the others connect again.
+  for (WebSocket* socket : websockets_) socket->peer.close("the certificates were read again");
 }
 
 // --- texts
@@ -471,12 +570,14 @@ bool Server::on_websocket(lws* connection, int reason, WebSocket*& socket, void*
                           std::size_t length) {
   if (reason == LWS_CALLBACK_ESTABLISHED) {
     socket = new WebSocket{Peer(connection), nullptr, {}};
+    websockets_.insert(socket);
     socket->connection = endpoints_.at(lws_get_protocol(connection)->name)(socket->peer);
     return true;
   }
   if (!socket) return true;
   switch (reason) {
     case LWS_CALLBACK_CLOSED:
+      websockets_.erase(socket);
       delete std::exchange(socket, nullptr);
       return true;
     case LWS_CALLBACK_RECEIVE:

@@ -85,9 +85,9 @@ struct ServerOptions {
   std::filesystem::path pages;       // the folder; index.html is the first page
   std::vector<std::string> hosts;    // further names by which this server may be called
   std::vector<std::string> origins;  // other servers whose pages may connect: "https://example.org"
-  // TLS if there is a certificate: files as PEM. With `authority` clients must have a certificate,
-  // of that CA.
-  std::filesystem::path certificate, key, authority;
+  // TLS if there is a certificate: files as PEM, read again when one changes. With `authority`
+  // clients must have a certificate, of that CA; `revoked` is its list of those that do not count.
+  std::filesystem::path certificate, key, authority, revoked;
 };
 
 class Server {
@@ -135,6 +135,7 @@ class Server {
 
  private:
   struct Library;  // what libwebsockets needs as long as its context lives
+  struct Credentials;
   struct Timer;
   struct WebSocket;
   struct Text {
@@ -161,11 +162,13 @@ class Server {
   static bool write_message(WebSocket& socket);
   // Why a client's request is refused, for people; empty: it is not.
   std::string refusal(lws* connection) const;
+  void follow_credentials();
   void call_posted();
   void end();
 
   const ServerOptions options_;
   std::unique_ptr<Library> library_;
+  std::unique_ptr<Credentials> credentials_;  // with TLS
   lws_context* context_ = nullptr;
   std::map<std::string, Connect> endpoints_;
   std::map<std::string, Text> texts_;
@@ -173,6 +176,7 @@ class Server {
   std::map<std::uint64_t, Request> requests_;  // by their numbers, from 1 on
   std::uint64_t last_request_ = 0;
   std::set<std::string> reported_;  // refusals
+  std::set<WebSocket*> websockets_;
   std::vector<std::unique_ptr<Timer>> timers_;
   std::mutex mutex_;
   std::vector<std::function<void()>> posted_;

@@ -24,7 +24,7 @@ from tree import Unavailable, mount_overlay  # noqa: E402
 # Installed at the start: the bare PC of a vehicle.
 PACKAGES = "systemd,dbus,python3,sudo,nftables"
 # Packages that the role and the packages may install.
-CACHED = "avahi-daemon chrony python3-apt"
+CACHED = "avahi-daemon chrony prometheus python3-apt"
 TIMEOUT_S = 60.0  # for actions that take about a second
 
 ADDRESSES = ("10.77.0.{}/24", "10.78.0.{}/24", "fd77::{}/64", "fd78::{}/64")

@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 from apt_source import AptSource, make_key
 from container import HERE, TIMEOUT_S, Container
-from service_tests import wait_until
+from service_tests import get, wait_until
 from tree import field, repack
 
 ANSIBLE = HERE.parent.parent / "ansible"
@@ -254,6 +254,7 @@ class IsolatedTests:
             ("the role deploys an isolated PC without nftables", self.deploy),
             ("a PC with dssm_insecure: false listens only at loopback", self.listen),
             ("the role runs the recorder only where it is configured", self.record),
+            ("the role runs the view, and has Prometheus watch the vehicle", self.view),
         ]
 
     def deploy(self) -> None:
@@ -273,6 +274,22 @@ class IsolatedTests:
         unit = self.container.run("systemctl", "show", "--property=ActiveState,UnitFileState",
                                   "dssm-record")
         assert unit.split() == ["ActiveState=inactive", "UnitFileState=disabled"], unit
+
+    def view(self) -> None:
+        """Test."""
+        packages = ["libdssm1", "dssmd", "dssm-tools", "dssm-view"]
+        output = self.playbooks.refused("site.yml", dssm_alerts=True)
+        assert "does not contain dssm-view" in output, output[-2000:]
+        variables = {"dssm_packages": packages, "dssm_alerts": True,
+                     "dssm_view": {"listen": "127.0.0.1:8766"}}
+        assert self.playbooks.run("site.yml", **variables) > 0
+        assert self.playbooks.run("site.yml", **variables) == 0, "a second run changes something"
+        prometheus = "http://127.0.0.1:9090/api/v1/"
+        wait_until(lambda: "DssmHostDown" in get(self.container, prometheus + "rules"),
+                   "Prometheus has no alert rules")
+        wait_until(lambda: '"host":"pc1"' in get(self.container,
+                                                 prometheus + "query?query=dssm_host_up"),
+                   "Prometheus has no metrics")
 
     def listen(self) -> None:
         """Test."""

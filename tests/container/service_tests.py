@@ -13,6 +13,13 @@ SOCKET = "/run/dssm/dssmd.sock"
 CONFIGURATION = "/etc/dssm/dssmd.conf"
 
 
+def get(container: Container, url: str) -> str:
+    """What a server answers in the container; empty: nothing."""
+    program = "import sys, urllib.request as web; print(web.urlopen(sys.argv[1]).read().decode())"
+    done = container.attempt("python3", "-c", program, url)
+    return done.stdout if done.returncode == 0 else ""
+
+
 class Clients:
     """Connect to dssmd's socket repeatedly, one after the other, inside the `with` block."""
 
@@ -205,21 +212,15 @@ class ServiceTests:
         file.write_text(right)
         self.container.run("systemctl", "disable", "dssm-record")
 
-    def get(self, url: str) -> str:
-        """What a server answers in the container; empty: nothing."""
-        program = "import sys, urllib.request as web; print(web.urlopen(sys.argv[1]).read().decode())"
-        done = self.container.attempt("python3", "-c", program, url)
-        return done.stdout if done.returncode == 0 else ""
-
     def view(self) -> None:
         """Test."""
         assert self.show("dssm-view.service", "UnitFileState") == "disabled"
         assert self.show("dssm-view.service", "ActiveState") == "inactive"
         self.container.run("systemctl", "start", "dssm-view")
-        wait_until(lambda: "dssm_host_up" in self.get("http://127.0.0.1:8765/metrics"),
+        wait_until(lambda: "dssm_host_up" in get(self.container, "http://127.0.0.1:8765/metrics"),
                    "there are no metrics")
-        assert "<title>" in self.get("http://127.0.0.1:8765/")
-        assert not self.get("http://10.77.0.2:8765/"), "it listens at other addresses, too"
+        assert "<title>" in get(self.container, "http://127.0.0.1:8765/")
+        assert not get(self.container, "http://10.77.0.2:8765/"), "it listens at other addresses, too"
         pid = self.show("dssm-view.service", "MainPID")
         assert self.container.run("stat", "--format=%U %G", f"/proc/{pid}") == "dssm-view dssm"
         saved = self.container.run("find", f"/proc/{pid}/root/var/tmp/", "-name", "dssm-view-*")

@@ -8,6 +8,7 @@
 # CHECK is the name of a function below, which says what its arguments are. Screenshots are written
 # to FOLDER. Prints lines for the test that runs it, and "ok" at the end; otherwise what went wrong,
 # with exit status 1. In no check may the page report an error in the browser's console.
+import glob
 import json
 import os
 import sys
@@ -239,12 +240,32 @@ def link(page, stream, *fields):
     page.wait("the overview", lambda: page.one("#overview").is_displayed())
 
 
+def allow_downloads(page):
+    page.driver.execute_cdp_cmd("Browser.setDownloadBehavior", {
+        "behavior": "allow", "downloadPath": page.folder})
+
+
+def export(page, stream, *fields):
+    """Prints the paths of what is exported of `fields`: as CSV, and as a picture."""
+    page.open("signals", signals={"span": 10, "panels": [[[stream, field] for field in fields]]})
+    allow_downloads(page)
+    page.wait("all samples", lambda: int(page.get(".panel", "data-points") or 0) >= 100)
+    page.press(" ")
+    page.wait("held", lambda: page.get("#time", "data-mode") == "hold")
+    for ending in ["csv", "png"]:
+        for old in glob.glob(os.path.join(page.folder, "dssm-signals-*." + ending)):
+            os.remove(old)
+        page.one("#export-" + ending).click()
+        found = page.wait("the file", lambda: glob.glob(
+            os.path.join(page.folder, "dssm-signals-*." + ending)))
+        say(ending, *found)
+
+
 def save(page, stream):
     """What the rings hold of `stream` is downloaded as a recording; prints its path."""
     page.open("views", views=[{"stream": stream, "kind": "property"}])
     page.wait("the property", lambda: page.one(card(stream) + " pre").text == "wheel_m = 0.1")
-    page.driver.execute_cdp_cmd("Browser.setDownloadBehavior", {
-        "behavior": "allow", "downloadPath": page.folder})
+    allow_downloads(page)
     page.press("s")
     page.wait("the dialog", lambda: page.one("#save-dialog").is_displayed())
     page.one("#save-range").send_keys("all that the rings hold")
@@ -369,7 +390,7 @@ def recording(page, stream, oldest_ns, newest_ns):
 
 
 CHECKS = {check.__name__: check for check in
-          [overview, signal, slider, link, save, views, drive, host_down, reconnect, phone, recording]}
+          [overview, signal, slider, link, export, save, views, drive, host_down, reconnect, phone, recording]}
 
 
 def main(check, url, folder, *arguments):

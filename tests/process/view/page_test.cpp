@@ -7,6 +7,7 @@
 #include <cmath>
 #include <dssm/recording.hpp>
 #include <filesystem>
+#include <map>
 #include <optional>
 
 #include "tests/process/view/view_fixture.hpp"
@@ -144,6 +145,29 @@ TEST_F(ViewPage, DrawsScansPosesImagesAndBytes) {
       session_.create_raw({"raw", 0, ""}, TypeInfo{"", some.size(), 1, {}}, depth_of(8)).value();
   raw.write(some);
   expect_ok("views", {"scan:0@pc1", "pose:0@pc1", "camera:0@pc1", "raw:0@pc1"});
+}
+
+TEST_F(ViewPage, ExportsWhatThePlotsShow) {
+  constexpr int kSamples = 100;
+  constexpr std::int64_t kCycle = 10'000'000;  // ns
+  auto motion = session_.create<Wheels>("motion", depth_of(kSamples + 1)).value();
+  for (int i = 0; i < kSamples; ++i) {
+    motion.write({0.1 * i, {}, -i}, at_ns(1000 * kSecond + i * kCycle));
+  }
+  Running page(page_argv("export", {kMotion, "x", "ticks"}), {});
+  std::map<std::string, std::string> files;
+  for (const std::string& line : lines(page, [] {})) {
+    const std::vector<std::string> words = words_of(line);
+    if (words.size() == 2) files[words[0]] = words[1];
+  }
+  const std::vector<std::string> rows = lines_of(text_of(files["csv"]));
+  ASSERT_EQ(rows.size(), 1U + kSamples);
+  EXPECT_EQ(rows[0], "time_ns,motion:0@pc1 tid,motion:0@pc1 x,motion:0@pc1 ticks");
+  EXPECT_EQ(rows[1], "1000000000000,0,0,0");
+  EXPECT_EQ(rows[51], "1000500000000,50,5,-50");
+  EXPECT_TRUE(text_of(files["png"]).starts_with("\x89PNG"));
+  std::filesystem::rename(files["png"], built("tests/process/view/page/export.png"));
+  std::filesystem::remove(files["csv"]);
 }
 
 TEST_F(ViewPage, SavesARecordingAndShowsAProperty) {

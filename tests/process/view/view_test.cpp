@@ -427,8 +427,14 @@ TEST_F(View, ByTlsServesOnlyClientsOfItsAuthority) {
   const std::string own = issue("truck", "--host", "pc1"),
                     laptop = issue("truck", "--program", "laptop"),
                     stranger = issue("other", "--program", "laptop");
+  const auto revoke = [&](const std::string& name) {
+    std::ofstream(own + "/revoked.crl") << pki({"revoke", name, "--ca", folder.file("truck")});
+  };
+  issue("truck", "--program", "old");
+  revoke("old");
   Running secure(view_argv({"--listen", "127.0.0.1:0", "--certificate", own + "/own.crt", "--key",
-                            own + "/own.key", "--authority", own + "/ca.crt"}),
+                            own + "/own.key", "--authority", own + "/ca.crt", "--revoked",
+                            own + "/revoked.crl"}),
                  environment());
   const std::string line = secure.line();
   ASSERT_TRUE(contains(line, "https://127.0.0.1:")) << line;
@@ -451,6 +457,20 @@ TEST_F(View, ByTlsServesOnlyClientsOfItsAuthority) {
   EXPECT_EQ(get(""), "");
   EXPECT_EQ(get(stranger), "");
   EXPECT_EQ(get(laptop), "200 TLSv1.3\n");
+
+  // Files that change are used without a restart; ones that are wrong are not.
+  const auto await_line = [&](const std::string& part) {
+    std::string said;
+    do said = secure.line();
+    while (!said.empty() && !contains(said, part));
+    EXPECT_FALSE(said.empty()) << part;
+  };
+  std::ofstream(own + "/revoked.crl") << "damaged";
+  await_line("holds no revocation list");
+  EXPECT_EQ(get(laptop), "200 TLSv1.3\n");
+  revoke("laptop");
+  await_line("read again");
+  EXPECT_EQ(get(laptop), "");
 }
 
 // --- the command line
@@ -467,6 +487,7 @@ TEST(ViewCommand, NamesWhatIsWrong) {
   EXPECT_TRUE(contains(open.second, "--insecure")) << open.second;
   EXPECT_EQ(refused({"--certificate", "a"}).first, 2);
   EXPECT_EQ(refused({"--authority", "a"}).first, 2);
+  EXPECT_EQ(refused({"--certificate", "a", "--key", "b", "--revoked", "c"}).first, 2);
   const TestFolder folder;
   std::ofstream(folder.file("view.conf")) << "listen = \"8765\"\nhost = [\"a\", \"b\"]\n";
   EXPECT_TRUE(contains(refused({"--config", folder.file("view.conf")}).second, "not ADDRESS:PORT"));
