@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <utility>
 
+#include "client/dssmctl/black_box_streams.hpp"
 #include "client/dssmctl/text.hpp"
 #include "client/dssmctl/trigger_watch.hpp"
 #include "core/base/try.hpp"
@@ -15,9 +16,10 @@ namespace {
 
 class BlackBox {
  public:
-  BlackBox(const RecordOptions& options, const RecordingOptions& how, Recorder& recorder,
-           TriggerWatch& watch, RecordingFolder& folder, Output& out)
+  BlackBox(const RecordOptions& options, Session session, const RecordingOptions& how,
+           Recorder& recorder, TriggerWatch& watch, RecordingFolder& folder, Output& out)
       : options_(options),
+        session_(std::move(session)),
         how_(how),
         recorder_(recorder),
         watch_(watch),
@@ -62,6 +64,7 @@ class BlackBox {
     RecordingWriter writer = DSSM_TRY(create_file(incident_name(WallClock::now(), trigger.name)));
     DSSM_TRY(writer.add_trigger(trigger));
     DSSM_TRY(recorder_.begin(std::move(writer), options_.before));
+    trigger_ = trigger;
     end_ = deadline_in(options_.after);
     last_end_ = deadline_in(std::max(options_.max_incident, options_.after));
     return {};
@@ -109,6 +112,27 @@ class BlackBox {
       out_.add(fmt::format("{}: {}\n", escaped(file_.string()), progress_text(recorder_)));
     }
     out_.flush();
+    announce();
+  }
+
+  // Created only now: a stream more would be in the way of those who never have an incident.
+  void announce() {
+    const RecordingProgress progress = recorder_.progress();
+    RecordedIncident incident{};
+    set_text(incident.trigger, trigger_.name);
+    set_text(incident.host, trigger_.host);
+    set_text(incident.reason, trigger_.reason);
+    set_text(incident.file, std::filesystem::absolute(file_).string());
+    incident.samples = progress.samples;
+    incident.lost_samples = progress.lost_samples;
+    Result<Writer<RecordedIncident>> writer = session_.create<RecordedIncident>(
+        kIncidentStream, History{64, std::chrono::seconds(1)}, {.keep_existing = true});
+    if (writer) {
+      writer->write(incident);
+    } else {
+      notice(fmt::format("other programs do not get to know of the incident: {}",
+                         escaped_message(writer.error().message)));
+    }
   }
 
   void make_room() {
@@ -126,12 +150,14 @@ class BlackBox {
   }
 
   const RecordOptions& options_;
+  Session session_;
   const RecordingOptions& how_;
   Recorder& recorder_;
   TriggerWatch& watch_;
   RecordingFolder& folder_;
   Output& out_;
   std::filesystem::path file_;       // of the incident that is being recorded, or of the last one
+  RecordedTrigger trigger_;          // which began it
   MonoTime end_{}, last_end_{};      // of it
   std::uint64_t written_bytes_ = 0;  // by incidents that have ended
 };
@@ -148,8 +174,8 @@ Result<void> run_black_box(const RecordOptions& options, Session session, const 
   DSSM_TRY(prepare(folder));
   catch_stop_signals();
   const std::unique_ptr<Recorder> recorder = DSSM_TRY(Recorder::start(session, std::nullopt, plan));
-  TriggerWatch watch(std::move(session), std::move(rules), options.min_interval);
-  BlackBox(options, how, *recorder, watch, folder, out).run();
+  TriggerWatch watch(session, std::move(rules), options.min_interval);
+  BlackBox(options, std::move(session), how, *recorder, watch, folder, out).run();
   return {};
 }
 

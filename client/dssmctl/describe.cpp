@@ -110,11 +110,13 @@ std::vector<std::string> host_row(const HostInfo& host) {
 }
 
 bool is_silent(const StreamInfo& stream) {
-  return stream.state == StreamState::stalled || stream.state == StreamState::no_writer;
+  return (stream.state == StreamState::stalled || stream.state == StreamState::no_writer) &&
+         !is_of_black_box(stream.id);
 }
 
 bool is_age_known(const StreamInfo& stream) {
-  return stream.state == StreamState::live || is_silent(stream);
+  return stream.state == StreamState::live || stream.state == StreamState::stalled ||
+         stream.state == StreamState::no_writer;
 }
 
 bool is_use_known(const StreamInfo& stream) {

@@ -33,7 +33,7 @@ std::string status_text(const ClockSnapshot& clock);  // "out of bounds: stepped
 
 Json stream_json(const StreamInfo& stream);
 
-// Whether samples should come and do not.
+// Whether samples should come and do not. Those of a black box come when something happens.
 bool is_silent(const StreamInfo& stream);
 // Whether stream.age has a meaning.
 bool is_age_known(const StreamInfo& stream);

@@ -7,11 +7,11 @@
 #include <algorithm>
 #include <thread>
 
+#include "client/dssmctl/black_box_streams.hpp"
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/options.hpp"
 #include "client/dssmctl/output.hpp"
 #include "client/dssmctl/text.hpp"
-#include "client/dssmctl/trigger_watch.hpp"
 #include "core/base/try.hpp"
 
 namespace dssm::ctl {
@@ -20,11 +20,6 @@ namespace {
 // Another host's dssmd gets it by then.
 constexpr Duration kMaxWait = std::chrono::seconds(3);
 constexpr Duration kPollPeriod = std::chrono::milliseconds(20);
-
-template <std::size_t N>
-void set_text(char (&out)[N], const std::string& text) {
-  text.copy(out, N - 1);
-}
 
 // Until the sample is in the stream's ring on its host.
 Result<void> request(Session& session, const StreamInfo& stream, const TriggerRequest& request) {

@@ -7,7 +7,6 @@
 
 #include <fmt/format.h>
 #include <fnmatch.h>
-#include <string.h>
 
 #include <algorithm>
 #include <array>
@@ -38,13 +37,13 @@ std::string_view trimmed(std::string_view text) {
 }
 
 bool is_about(const std::string& pattern, const StreamId& stream) {
-  return stream.name != kTriggerStream && StreamFilter({}, {pattern}).takes(stream);
+  return !is_of_black_box(stream) && StreamFilter({}, {pattern}).takes(stream);
 }
 
 // Printable: it comes into files, whose texts are UTF-8, and into the journal.
 template <std::size_t N>
 std::string text_untrusted(const char (&text)[N]) {
-  return escaped({text, ::strnlen(text, N)});
+  return escaped(text_in(text));
 }
 
 }  // namespace

@@ -13,7 +13,6 @@
 
 #include <condition_variable>
 #include <cstdint>
-#include <dssm/describe.hpp>
 #include <dssm/recording.hpp>
 #include <dssm/session.hpp>
 #include <map>
@@ -28,17 +27,9 @@
 #include <utility>
 #include <vector>
 
-namespace dssm::ctl {
+#include "client/dssmctl/black_box_streams.hpp"
 
-// A sample of the stream kTriggerStream, which each black box has on its host: who writes one there
-// asks for an incident. Texts end at their first zero byte.
-struct TriggerRequest {
-  char name[64];
-  char host[32];  // where it was requested
-  char reason[416];
-};
-DSSM_DESCRIBE(TriggerRequest, name, host, reason)
-inline constexpr const char* kTriggerStream = "dssm_trigger";
+namespace dssm::ctl {
 
 struct TriggerRule {
   enum class Kind : unsigned char { field, stalled, crashed, clock };

@@ -245,6 +245,8 @@ void StateCollector::find_events(const std::vector<HostInfo>& hosts) {
 
   std::map<std::string, StreamState> new_streams;
   for (const StreamInfo& stream : state_.streams) {
+    if (stream.id.name == ctl::kIncidentStream) find_incidents(stream);
+    if (ctl::is_of_black_box(stream.id)) continue;
     const std::string name = stream.id.str();
     new_streams[name] = stream.state;
     if (is_first) continue;
@@ -264,6 +266,30 @@ void StateCollector::find_events(const std::vector<HostInfo>& hosts) {
     if (!new_streams.contains(name)) add_event(false, fmt::format("stream {} is gone", name));
   }
   streams_ = std::move(new_streams);
+}
+
+// Those from when dssm-view was started on.
+void StateCollector::find_incidents(const StreamInfo& stream) {
+  const std::string name = stream.id.str();
+  auto reader = incidents_.find(name);
+  if (reader == incidents_.end()) {
+    Result<Reader<ctl::RecordedIncident>> opened =
+        session_.open_reader<ctl::RecordedIncident>(name);
+    if (!opened) return;
+    opened->seek(kNoTid);
+    reader = incidents_.emplace(name, *std::move(opened)).first;
+  }
+  for (int i = 0; i < kMaxIncidents; ++i) {
+    const auto incident = reader->second.read_next();
+    if (incident.status() == ReadStatus::restarted) continue;
+    if (!incident) return;
+    if (incident->time() < started_) continue;
+    const ctl::RecordedIncident& found = incident->value;
+    const std::string reason = ctl::text_in(found.reason);
+    add_event(true, fmt::format("incident recorded on {}: {} of {}{}; {}", stream.id.host,
+                                ctl::text_in(found.trigger), ctl::text_in(found.host),
+                                reason.empty() ? "" : ": " + reason, ctl::text_in(found.file)));
+  }
 }
 
 void StateCollector::add_event(bool is_warning, std::string text) {

@@ -19,6 +19,7 @@
 #include <utility>
 #include <vector>
 
+#include "client/dssmctl/black_box_streams.hpp"
 #include "client/dssmctl/output.hpp"
 
 namespace dssm::view {
@@ -57,15 +58,19 @@ class StateCollector {
   static constexpr Duration kWantedTime = std::chrono::seconds(5);
   static constexpr Duration kFindingsPeriod = std::chrono::seconds(10);
   static constexpr std::size_t kMaxEvents = 200;
+  static constexpr int kMaxIncidents = 64;  // of one black box, in one turn
 
   void run();
   Result<void> collect(bool all);
   void find_events(const std::vector<HostInfo>& hosts);
+  void find_incidents(const StreamInfo& stream);
   void add_event(bool is_warning, std::string text);
 
   Session session_;
   const std::string socket_path_;
   std::function<void(const VehicleState&)> on_state_;
+
+  const Time started_ = WallClock::now();
 
   // The thread's.
   VehicleState state_;
@@ -74,6 +79,7 @@ class StateCollector {
   bool is_connected_ = true;
   std::map<std::string, std::pair<HostState, bool>> hosts_;  // and whether its clock is refused
   std::map<std::string, StreamState> streams_;
+  std::map<std::string, Reader<ctl::RecordedIncident>> incidents_;  // of all black boxes
   std::deque<ctl::Json> events_;
   std::uint64_t last_event_ = 0;
 

@@ -12,6 +12,7 @@
 #include <fstream>
 #include <thread>
 
+#include "client/dssmctl/black_box_streams.hpp"
 #include "tests/process/dssmctl/fleet_test.hpp"
 #include "tests/support/folder.hpp"
 
@@ -101,6 +102,15 @@ TEST_F(BlackBox, KeepsWhatWasBeforeAndAfterARequest) {
   const std::string ended = running.line();
   EXPECT_TRUE(ended.starts_with(file + ": 201 samples of 2 streams, ")) << ended;
   EXPECT_EQ(numbers_in(file), range(0, 199));
+  // Other programs get to know of it.
+  auto incidents = session_.await_reader<ctl::RecordedIncident>("dssm_incident").value();
+  await([&] { return incidents.read_newest().status() == ReadStatus::ok; });
+  const ctl::RecordedIncident incident = incidents.read_newest()->value;
+  EXPECT_STREQ(incident.trigger, "hard stop/1");
+  EXPECT_STREQ(incident.host, "pc1");
+  EXPECT_STREQ(incident.reason, "a person said so");
+  EXPECT_EQ(incident.file, file);
+  EXPECT_EQ(incident.samples, 201U);
 
   const Recording recording = Recording::open(file).value();
   auto reader = recording.open_reader<Power>("power").value();

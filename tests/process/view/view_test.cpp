@@ -8,6 +8,7 @@
 #include <filesystem>
 #include <fstream>
 
+#include "client/dssmctl/black_box_streams.hpp"
 #include "tests/process/view/view_fixture.hpp"
 #include "tests/support/folder.hpp"
 #include "tests/support/samples.hpp"
@@ -174,6 +175,23 @@ TEST_F(View, ShowsHostsStreamsAndPrograms) {
                                 [](const Json& host) { return host["host"] == "pc3"; });
   ASSERT_NE(pc3, overview["hosts"].end());
   EXPECT_EQ((*pc3)["state"], "down") << overview["hosts"];
+}
+
+// As a black box announces it.
+TEST_F(View, TellsOfRecordedIncidents) {
+  ctl::RecordedIncident incident{};
+  ctl::set_text(incident.trigger, "bumper");
+  ctl::set_text(incident.host, "pc3");
+  ctl::set_text(incident.reason, "it hit <b>something</b>");
+  ctl::set_text(incident.file, "/var/lib/dssm-record/a.mcap");
+  on_pc2_.create<ctl::RecordedIncident>("dssm_incident", depth_of(8)).value().write(incident);
+  await([&] {
+    const std::string events = ask({{"op", "overview"}})["events"].dump();
+    return contains(events,
+                    "incident recorded on pc2: bumper of pc3: it hit <b>something</b>; "
+                    "/var/lib/dssm-record/a.mcap") &&
+           !contains(events, "stream dssm_incident");
+  });
 }
 
 TEST_F(View, SaysSoWhileDssmdIsGone) {
