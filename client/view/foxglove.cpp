@@ -80,7 +80,15 @@ class FoxgloveConnection : public Connection {
                  {"metadata", {{"host", clients_.name_}}},
                  {"sessionId", clients_.session_id_}};
     if (const auto* recording = std::get_if<Recording>(&clients_.played_)) {
-      playback_.emplace(*recording);
+      playback_.emplace(clients_.range_.value_or(TimeRange{}), recording);
+    } else if (peer_.path() == FoxgloveClients::kHoldPath) {
+      if (!clients_.range_) {
+        peer_.close("the rings hold no sample yet");
+        return;
+      }
+      playback_.emplace(*clients_.range_, nullptr);
+    }
+    if (playback_) {
       info["capabilities"] = {"time", "playbackControl"};
       info["dataStartTime"] = seconds_json(playback_->begin);
       info["dataEndTime"] = seconds_json(playback_->end);
@@ -200,23 +208,20 @@ class FoxgloveConnection : public Connection {
     bool wants_present = true;  // of a recording: it has not got a sample of the position yet
   };
 
-  // Where this client is in the recording.
+  // Where this client is in the recording, or in what the rings held when it connected.
   struct Playback {
-    explicit Playback(const Recording& recording) : cursor(recording.cursor()) {
-      bool is_first = true;
-      for (const RecordedStreamInfo& stream : recording.streams()) {
+    Playback(TimeRange range, const Recording* recording)
+        : begin(range.first), end(range.last), position(range.first) {
+      if (!recording) return;
+      cursor = recording->cursor();
+      for (const RecordedStreamInfo& stream : recording->streams()) {
         names.push_back(stream.id.str());
-        if (stream.samples == 0) continue;
-        begin = is_first ? stream.first_time : std::min(begin, stream.first_time);
-        end = is_first ? stream.last_time : std::max(end, stream.last_time);
-        is_first = false;
       }
-      position = begin;
     }
     bool is_ended() const { return position >= end; }
 
-    RecordingCursor cursor;
-    std::vector<std::string> names;  // of the streams, by their indices in the recording
+    std::optional<RecordingCursor> cursor;  // none: of the rings
+    std::vector<std::string> names;         // of the streams, by their indices in the recording
     Time begin{}, end{};
     Time position{};                     // what is before it was sent
     std::optional<RecordedSample> next;  // the cursor's, which is not due yet
@@ -264,9 +269,12 @@ class FoxgloveConnection : public Connection {
   // Every subscription gets the sample of that time, too, so that what is paused is shown.
   void seek(Time time) {
     playback_->position = std::clamp(time, playback_->begin, playback_->end);
-    playback_->cursor.seek(playback_->position);
+    if (playback_->cursor) playback_->cursor->seek(playback_->position);
     playback_->next.reset();
-    for (auto& [id, subscription] : subscriptions_) subscription.wants_present = true;
+    for (auto& [id, subscription] : subscriptions_) {
+      subscription.wants_present = true;
+      subscription.next = kNoTid;
+    }
   }
 
   void play(MonoTime now) {
@@ -279,6 +287,19 @@ class FoxgloveConnection : public Connection {
     const Time until = std::min(
         ctl::saturating_add(playback.position, std::chrono::duration_cast<Duration>(passed)),
         playback.end);
+    const Time sent_until = playback.cursor ? play_recording(until) : play_rings(until);
+    // A client that is slower than its speed gets all, later.
+    playback.position = std::clamp(sent_until, playback.position, until);
+    playback.moved = now;
+    if (playback.is_ended()) {
+      playback.is_playing = false;
+      send_playback_state(false, {});
+    }
+  }
+
+  // Sends what comes until that time, and returns it; or a time before what is sent later.
+  Time play_recording(Time until) {
+    Playback& playback = *playback_;
     std::map<std::string, std::vector<std::uint32_t>> subscribers;
     for (const auto& [id, subscription] : subscriptions_) {
       const auto channel = clients_.channels_.find(subscription.channel);
@@ -287,16 +308,13 @@ class FoxgloveConnection : public Connection {
     for (int i = 0;; ++i) {
       if (!playback.next) {
         RecordedSample sample;
-        if (!playback.cursor.next(sample)) break;
+        if (!playback.cursor->next(sample)) break;
         playback.next = sample;
       }
       const RecordedSample& sample = *playback.next;
       if (sample.info.time > until) break;
       if (i == kMaxPlayedSamples || peer_.waiting_bytes() >= kMaxWaitingBytes) {
-        // The client is slower than its speed: it gets all, later.
-        playback.position = std::clamp(sample.info.time, playback.position, until);
-        playback.moved = now;
-        return;
+        return ctl::saturating_add(sample.info.time, -Duration(1));
       }
       const auto found = subscribers.find(playback.names[sample.stream]);
       if (found != subscribers.end()) {
@@ -307,12 +325,59 @@ class FoxgloveConnection : public Connection {
       }
       playback.next.reset();
     }
-    playback.position = until;
-    playback.moved = now;
-    if (playback.is_ended()) {
-      playback.is_playing = false;
-      send_playback_state(false, {});
+    return until;
+  }
+
+  // A sample of a ring that is to be sent.
+  struct Due {
+    Time time;
+    std::uint32_t subscription;
+    Tid tid;
+  };
+
+  // Of each subscription the samples after the last one sent, until `until`, or until there are
+  // many; then `until` is before the others.
+  std::vector<Due> due_of_rings(Time& until) {
+    std::vector<Due> due;
+    for (auto& [id, subscription] : subscriptions_) {
+      const auto channel = clients_.channels_.find(subscription.channel);
+      if (channel == clients_.channels_.end()) continue;
+      OpenStream* const stream = clients_.streams_.find(channel->second.stream).stream;
+      if (!stream) continue;
+      const RawReader& reader = std::get<RawReader>(stream->reader);
+      SampleInfo info;
+      if (subscription.next == kNoTid) {
+        const bool is_found = reader.find(playback_->position, info) == ReadStatus::ok;
+        subscription.next = is_found ? info.tid + 1 : 0;
+      }
+      // What is older was overwritten meanwhile.
+      Tid tid = subscription.next = std::max(subscription.next, reader.oldest_tid());
+      for (int i = 0; i < kMaxPlayedSamples; ++i, ++tid) {
+        if (reader.read_info(tid, info) != ReadStatus::ok || info.time > until) break;
+        due.push_back({info.time, id, tid});
+        if (i == kMaxPlayedSamples - 1) until = info.time;
+      }
     }
+    std::erase_if(due, [&](const Due& one) { return one.time > until; });
+    std::ranges::stable_sort(due, {}, &Due::time);
+    return due;
+  }
+
+  Time play_rings(Time until) {
+    for (const Due& due : due_of_rings(until)) {
+      if (peer_.waiting_bytes() >= kMaxWaitingBytes) return ctl::saturating_add(due.time, -Duration(1));
+      Subscription& subscription = subscriptions_.at(due.subscription);
+      const FoxgloveClients::Channel& channel = clients_.channels_.at(subscription.channel);
+      RawReader& reader =
+          std::get<RawReader>(clients_.streams_.find(channel.stream).stream->reader);
+      BorrowedSample sample;
+      subscription.next = due.tid + 1;
+      if (reader.borrow(due.tid, sample) != ReadStatus::ok) continue;
+      Message message =
+          sample_message(due.subscription, channel.type, sample.info(), sample.payload());
+      if (sample.still_valid()) peer_.send(std::move(message));
+    }
+    return until;
   }
 
   // The sample that the stream had at the position.
@@ -321,11 +386,16 @@ class FoxgloveConnection : public Connection {
     if (channel == clients_.channels_.end()) return;
     const Streams::Found found = clients_.streams_.find(channel->second.stream);
     if (!found.stream) return;  // it is being opened
-    RecordedRawReader& reader = std::get<RecordedRawReader>(found.stream->reader);
-    std::vector<std::byte> payload(reader.payload_bytes());
+    std::vector<std::byte> payload;
     SampleInfo info;
-    const ReadStatus status =
-        past_restarts([&] { return reader.read_at(playback_->position, payload, info); });
+    const auto read = [&](auto& reader) {
+      payload.resize(reader.payload_bytes());
+      return reader.read_at(playback_->position, payload, info);
+    };
+    auto* const recorded = std::get_if<RecordedRawReader>(&found.stream->reader);
+    const ReadStatus status = recorded ? past_restarts([&] { return read(*recorded); })
+                                       : read(std::get<RawReader>(found.stream->reader));
+    if (status == ReadStatus::arriving || status == ReadStatus::restarted) return;  // soon
     subscription.wants_present = false;
     if (status == ReadStatus::ok) {
       send_sample(id, channel->second, info, std::span(payload).first(info.payload_bytes));
@@ -445,6 +515,7 @@ std::unique_ptr<Connection> FoxgloveClients::connect(Peer& peer) {
 }
 
 void FoxgloveClients::on_state(const VehicleState& state) {
+  range_ = state.range;
   std::set<std::pair<std::string, std::uint64_t>> there;
   for (const StreamInfo& stream : state.streams) {
     const std::string name = stream.id.str();

@@ -6,7 +6,8 @@
 //
 // Samples are sent as they come. Of those that the other end does not take in time none waits here
 // beyond a budget: they are left out, and it is told how many. A recording is played to each client
-// as that asks for it ("playback control"), at the client's pace.
+// as that asks for it ("playback control"), at the client's pace; so is what the rings hold to one
+// that connects at kHoldPath, while the vehicle goes on.
 #pragma once
 
 #include <cstdint>
@@ -15,8 +16,10 @@
 #include <functional>
 #include <map>
 #include <memory>
+#include <optional>
 #include <set>
 #include <string>
+#include <string_view>
 #include <variant>
 #include <vector>
 
@@ -47,6 +50,8 @@ class FoxgloveClients {
   void send_samples();
   static constexpr Duration kSendPeriod = std::chrono::milliseconds(10);
 
+  static constexpr std::string_view kHoldPath = "/hold";
+
  private:
   friend class FoxgloveConnection;
   struct Channel {
@@ -62,7 +67,8 @@ class FoxgloveClients {
   std::variant<PlaybackClock, Recording> played_;
   std::map<std::uint32_t, Channel> channels_;  // by their ids
   std::uint32_t last_channel_ = 0;
-  std::string graph_;  // the message about programs and streams
+  std::string graph_;               // the message about programs and streams
+  std::optional<TimeRange> range_;  // of all samples
   const std::string session_id_;
   std::set<FoxgloveConnection*> connections_;
 };

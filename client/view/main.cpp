@@ -142,7 +142,7 @@ Result<void> serve(Options options) {
     collector->start(
         [&](const VehicleState& state) { server.post([&, state] { on_state(state); }); });
   } else {
-    server.post([&] { on_state(*recorded); });
+    on_state(*recorded);
   }
 
   running_server = &server;

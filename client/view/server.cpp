@@ -569,7 +569,7 @@ bool Server::write_text(lws* connection, Request& request) {
 bool Server::on_websocket(lws* connection, int reason, WebSocket*& socket, void* in,
                           std::size_t length) {
   if (reason == LWS_CALLBACK_ESTABLISHED) {
-    socket = new WebSocket{Peer(connection), nullptr, {}};
+    socket = new WebSocket{Peer(connection, header(connection, WSI_TOKEN_GET_URI)), nullptr, {}};
     websockets_.insert(socket);
     socket->connection = endpoints_.at(lws_get_protocol(connection)->name)(socket->peer);
     return true;

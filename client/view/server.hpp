@@ -25,6 +25,7 @@
 #include <span>
 #include <string>
 #include <string_view>
+#include <utility>
 #include <vector>
 
 struct lws;
@@ -53,6 +54,8 @@ class Message {
 class Peer {
  public:
   void send(Message message);
+  // The path at which it connected: "/", "/hold".
+  const std::string& path() const { return path_; }
   std::size_t waiting() const { return waiting_.size(); }
   std::size_t waiting_bytes() const { return waiting_bytes_; }
   // Ends the connection, at once: what waits is lost.
@@ -61,8 +64,9 @@ class Peer {
 
  private:
   friend class Server;
-  explicit Peer(lws* connection) : connection_(connection) {}
+  Peer(lws* connection, std::string path) : connection_(connection), path_(std::move(path)) {}
   lws* connection_;
+  std::string path_;
   std::deque<Message> waiting_;
   std::size_t waiting_bytes_ = 0;
   bool is_closing_ = false;

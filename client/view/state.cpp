@@ -28,8 +28,19 @@ std::optional<Time> oldest_time(const StreamInfo& stream) {
       -Duration(static_cast<std::int64_t>(std::min(length_s, kMaxSeconds) * 1e9)));
 }
 
-Json streams_json(const std::vector<StreamInfo>& streams, Json& range) {
-  std::optional<Time> first, last;
+void extend(std::optional<TimeRange>& range, Time first, Time last) {
+  if (!range) range = {first, last};
+  range->first = std::min(range->first, first);
+  range->last = std::max(range->last, last);
+}
+
+Json range_json(const std::optional<TimeRange>& range) {
+  if (!range) return {};
+  return {{"oldest_ns", time_json(range->first)}, {"newest_ns", time_json(range->last)}};
+}
+
+Json streams_json(const std::vector<StreamInfo>& streams, std::optional<TimeRange>& range) {
+  range.reset();
   Json list = Json::array();
   for (const StreamInfo& stream : streams) {
     const std::optional<Time> oldest = oldest_time(stream);
@@ -38,11 +49,8 @@ Json streams_json(const std::vector<StreamInfo>& streams, Json& range) {
     json["newest_ns"] = oldest ? time_json(stream.newest_time) : Json();
     json["mirror"] = stream.mirror ? ctl::mirror_json(*stream.mirror) : Json();
     list.push_back(std::move(json));
-    if (!oldest) continue;
-    first = std::min(first.value_or(*oldest), *oldest);
-    last = std::max(last.value_or(stream.newest_time), stream.newest_time);
+    if (oldest) extend(range, *oldest, stream.newest_time);
   }
-  range = first ? Json{{"oldest_ns", time_json(*first)}, {"newest_ns", time_json(*last)}} : Json();
   return list;
 }
 
@@ -50,13 +58,11 @@ Json streams_json(const std::vector<StreamInfo>& streams, Json& range) {
 Json recorded_stream_json(const std::vector<const RecordedStreamInfo*>& incarnations,
                           const StreamInfo& stream) {
   std::uint64_t samples = 0, lost_samples = 0;
-  std::optional<Time> first, last;
+  std::optional<TimeRange> range;
   for (const RecordedStreamInfo* one : incarnations) {
     samples += one->samples;
     lost_samples += one->lost_samples;
-    if (one->samples == 0) continue;
-    first = std::min(first.value_or(one->first_time), one->first_time);
-    last = std::max(last.value_or(one->last_time), one->last_time);
+    if (one->samples > 0) extend(range, one->first_time, one->last_time);
   }
   Json json = ctl::stream_json(stream);
   json["state"] = "recorded";
@@ -64,12 +70,13 @@ Json recorded_stream_json(const std::vector<const RecordedStreamInfo*>& incarnat
     json[unknown] = nullptr;
   }
   const double length_s =
-      first ? std::chrono::duration<double>(ctl::saturating_sub(*last, *first)).count() : 0;
+      range ? std::chrono::duration<double>(ctl::saturating_sub(range->last, range->first)).count()
+            : 0;
   json["rate_hz"] = length_s > 0 ? Json(static_cast<double>(samples - 1) / length_s) : Json();
   json["samples"] = samples;
   json["lost_samples"] = lost_samples;
-  json["oldest_ns"] = first ? time_json(*first) : Json();
-  json["newest_ns"] = last ? time_json(*last) : Json();
+  json["oldest_ns"] = range ? time_json(range->first) : Json();
+  json["newest_ns"] = range ? time_json(range->last) : Json();
   json["mirror"] = nullptr;
   return json;
 }
@@ -80,12 +87,9 @@ VehicleState recorded_state(const Recording& recording) {
   VehicleState state;
   state.has_all = true;
   std::map<std::string, std::vector<const RecordedStreamInfo*>> streams;  // by their full names
-  std::optional<Time> first, last;
   for (const RecordedStreamInfo& stream : recording.streams()) {
     streams[stream.id.str()].push_back(&stream);
-    if (stream.samples == 0) continue;
-    first = std::min(first.value_or(stream.first_time), stream.first_time);
-    last = std::max(last.value_or(stream.last_time), stream.last_time);
+    if (stream.samples > 0) extend(state.range, stream.first_time, stream.last_time);
   }
   Json& json = state.json;
   json["streams"] = Json::array();
@@ -103,8 +107,7 @@ VehicleState recorded_state(const Recording& recording) {
     json["streams"].push_back(recorded_stream_json(incarnations, stream));
     state.streams.push_back(std::move(stream));
   }
-  json["range"] =
-      first ? Json{{"oldest_ns", time_json(*first)}, {"newest_ns", time_json(*last)}} : Json();
+  json["range"] = range_json(state.range);
   json["recording"] = Json::array();
   for (const std::filesystem::path& file : recording.files()) {
     json["recording"].push_back(ctl::escaped(file.filename().string()));
@@ -186,7 +189,8 @@ Result<void> StateCollector::collect(bool all) {
   Json& json = state_.json;
   json["host"] = daemon.host;
   json["version"] = daemon.version;
-  json["streams"] = streams_json(state_.streams, json["range"]);
+  json["streams"] = streams_json(state_.streams, state_.range);
+  json["range"] = range_json(state_.range);
   json["hosts"] = Json::array();
   for (const HostInfo& host : hosts) {
     // Another address of a host that is there already.

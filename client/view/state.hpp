@@ -27,12 +27,17 @@ namespace dssm::view {
 // JavaScript's numbers are too coarse for nanoseconds since 1970, so times are texts.
 inline ctl::Json time_json(Time time) { return std::to_string(to_ns(time)); }
 
+struct TimeRange {
+  Time first, last;
+};
+
 // NOLINTNEXTLINE(bugprone-exception-escape): the moves of Json throw nothing
 struct VehicleState {
   std::string host;
   std::vector<StreamInfo> streams;
   std::vector<NodeInfo> nodes;
-  bool has_all = false;  // also programs and findings are of now
+  std::optional<TimeRange> range;  // of all samples, about; empty: there are none
+  bool has_all = false;            // also programs and findings are of now
   ctl::Json json;  // an answer to "overview" of the page's protocol (docs/view.md), without its id
 };
 

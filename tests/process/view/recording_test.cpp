@@ -160,13 +160,8 @@ TEST_F(ViewRecording, HasCurvesOfAllOfItWithEachPeak) {
 }
 
 TEST_F(ViewRecording, IsPlayedByFoxglovesPlaybackControl) {
-  const std::vector<std::string> lines =
-      run_client(url_, "play", {"pause 1 " + ns_after(3004), "play 100 " + ns_after(18'000)});
-  const std::string all = [&] {
-    std::string text;
-    for (const std::string& line : lines) text += line + "\n";
-    return text;
-  }();
+  const std::string all = joined(
+      run_client(url_, "play", {"pause 1 " + ns_after(3004), "play 100 " + ns_after(18'000)}));
   EXPECT_TRUE(contains(all, "from 1700000000.000000000 to 1700000019.990000000\n")) << all;
   EXPECT_TRUE(contains(all, "state paused " + ns_after(3004) + " seek 0\n")) << all;
   EXPECT_TRUE(contains(all, "pose@pc1 " + ns_after(3000) + "\n")) << all;

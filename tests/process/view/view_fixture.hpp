@@ -40,6 +40,12 @@ inline std::vector<std::string> run_client(const std::string& url, const std::st
   return lines_of(finished.out);
 }
 
+inline std::string joined(const std::vector<std::string>& lines) {
+  std::string text;
+  for (const std::string& line : lines) text += line + "\n";
+  return text;
+}
+
 struct Motion {
   double x;
   float speed[3];

@@ -384,6 +384,31 @@ TEST_F(View, GivesTheProperty) {
   EXPECT_TRUE(contains(ask({{"op", "property"}, {"stream", "a b:x"}})["error"].dump(), "a b"));
 }
 
+// Foxglove scrubs what the rings held when it connected.
+TEST_F(View, PlaysWhatTheRingsHoldToFoxglove) {
+  auto motion = session_.create<Motion>("motion", depth_of(200)).value();
+  auto lidar = on_pc2_.create<std::int64_t>("lidar", depth_of(200)).value();
+  const auto ns = [](int i) { return 1000 * kSecond + i * 10'000'000; };
+  for (int i = 0; i < 200; ++i) {
+    motion.write({0.5 * i, {}, i}, at_ns(ns(i)));
+    if (i % 10 == 0) lidar.write(i, at_ns(ns(i)));
+  }
+  await([&] {
+    const Json overview = ask({{"op", "overview"}});
+    return overview["streams"].size() == 2 &&
+           overview["range"]["newest_ns"] == std::to_string(ns(199));
+  });
+  const std::string all = joined(
+      run_client(url_ + "hold", "play",
+                 {"pause 1 " + std::to_string(ns(50)), "play 10 " + std::to_string(ns(100))}));
+  EXPECT_TRUE(contains(all, " to 1001.990000000\n")) << all;
+  EXPECT_TRUE(contains(all, "motion@pc1 " + std::to_string(ns(50)) + "\n")) << all;
+  EXPECT_TRUE(contains(all, "lidar@pc2 " + std::to_string(ns(50)) + "\n")) << all;
+  EXPECT_TRUE(contains(all, "state ended " + std::to_string(ns(199)) + "\n")) << all;
+  EXPECT_TRUE(contains(all, "played motion@pc1 100 in order\n")) << all;
+  EXPECT_TRUE(contains(all, "played lidar@pc2 10 in order\n")) << all;
+}
+
 // --- clients that do not read
 
 TEST_F(View, DelaysNobodyForABrowserThatStands) {
