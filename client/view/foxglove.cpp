@@ -365,7 +365,8 @@ class FoxgloveConnection : public Connection {
 
   Time play_rings(Time until) {
     for (const Due& due : due_of_rings(until)) {
-      if (peer_.waiting_bytes() >= kMaxWaitingBytes) return ctl::saturating_add(due.time, -Duration(1));
+      if (peer_.waiting_bytes() >= kMaxWaitingBytes)
+        return ctl::saturating_add(due.time, -Duration(1));
       Subscription& subscription = subscriptions_.at(due.subscription);
       const FoxgloveClients::Channel& channel = clients_.channels_.at(subscription.channel);
       RawReader& reader =
