@@ -85,3 +85,5 @@ def type_info(type: Any, name: str | None = None) -> TypeInfo:
 # What needs asyncio is written in Python.
 Reader.__aiter__ = _asyncio.samples  # type: ignore[method-assign, assignment]
 Reader.wait_async = _asyncio.wait  # type: ignore[method-assign]
+Reader.close = _asyncio.close  # type: ignore[method-assign]
+Reader.__exit__ = _asyncio.leave  # type: ignore[method-assign]

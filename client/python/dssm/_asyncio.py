@@ -12,8 +12,9 @@ from types import TracebackType
 from dssm._dssm import Reader, Sample
 from dssm._errors import InUse
 
-# Descriptors that a task waits for: a loop has one callback for each.
-_awaited: set[int] = set()
+# By the descriptors that tasks wait for: a loop has one callback for each.
+_awaited: dict[int, "_Ready"] = {}
+_close = Reader.close
 
 
 class _Ready:
@@ -21,29 +22,55 @@ class _Ready:
 
     def __init__(self, reader: Reader) -> None:
         self.event = asyncio.Event()
-        self._reader = reader
+        self.reader = reader
         self._fd = reader.fileno()
 
     def __enter__(self) -> "_Ready":
         if self._fd in _awaited:
-            raise InUse(f"another task waits for samples of '{self._reader.name}': give each task a reader of its own")
+            raise InUse(f"another task waits for samples of '{self.reader.name}': give each task a reader of its own")
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(self._fd, self._on_readable)
-        _awaited.add(self._fd)
+        _awaited[self._fd] = self
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
-        _awaited.discard(self._fd)
+        self._stop_waiting()
+
+    def _stop_waiting(self) -> None:
+        # The descriptor may be another reader's by now.
+        if _awaited.get(self._fd) is not self:
+            return
+        del _awaited[self._fd]
         if not self._loop.is_closed():
             self._loop.remove_reader(self._fd)
 
+    def end(self) -> None:
+        """Before the reader is closed, by this loop's thread or by another one."""
+        if asyncio._get_running_loop() is self._loop:
+            self._stop_waiting()
+            self.event.set()
+        elif not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._stop_waiting)
+            self._loop.call_soon_threadsafe(self.event.set)
+
     def _on_readable(self) -> None:
-        if self._reader.closed:  # its descriptor is closed, too
-            self._loop.remove_reader(self._fd)
-        else:
-            self._reader.clear_ready()
+        if not self.reader.closed:
+            self.reader.clear_ready()
         self.event.set()
+
+
+def close(reader: Reader) -> None:
+    """Closes it; a task that waits for it gets the error of a closed reader."""
+    for ready in list(_awaited.values()):
+        if ready.reader is reader:
+            ready.end()
+    _close(reader)
+
+
+def leave(reader: Reader, *_: object) -> None:
+    """At the end of a `with` block."""
+    close(reader)
 
 
 async def samples(reader: Reader) -> AsyncIterator[Sample]:

@@ -743,6 +743,27 @@ class Asyncio(Case):
 
         asyncio.run(asyncio.wait_for(run(), PATIENT_S))
 
+    def test_closing_ends_waiting(self):
+        async def iterate():
+            async for _ in self.reader:
+                self.fail("there is no sample")
+
+        async def run(wait, close):
+            waiting = asyncio.create_task(wait())
+            await asyncio.sleep(0)
+            await close()
+            with self.assertRaises(dssm.Closed):
+                await waiting
+
+        async def close():
+            self.reader.close()
+
+        for wait in iterate, lambda: self.reader.wait_async():
+            for end in close, lambda: asyncio.to_thread(self.reader.close):
+                self.reader = self.session.reader("async")
+                self.reader.seek(self.reader.newest_tid)
+                asyncio.run(asyncio.wait_for(run(wait, end), PATIENT_S))
+
     def test_several_readers_in_one_loop(self):
         async def first(reader):
             async for sample in reader:
