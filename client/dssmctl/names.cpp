@@ -54,6 +54,15 @@ bool StreamFilter::takes(const StreamId& id) const {
                      [&](const std::string& pattern) { return is_named(id, pattern); });
 }
 
+std::string pattern_of(const std::string& name) {
+  std::string pattern;
+  for (const char c : name) {
+    if (c == '*' || c == '?' || c == '[' || c == '\\') pattern += '\\';
+    pattern += c;
+  }
+  return pattern;
+}
+
 std::vector<std::pair<std::string, std::string>> splits_at_dots(const std::string& text) {
   std::vector<std::pair<std::string, std::string>> parts;
   for (std::size_t dot = text.find('.'); dot != text.npos; dot = text.find('.', dot + 1)) {

@@ -44,6 +44,9 @@ class Duplicates {
   std::map<Key, std::vector<std::string>> owners_;
 };
 
+// A pattern for StreamFilter that only this full name fits.
+std::string pattern_of(const std::string& name);
+
 // Which streams are listed or recorded.
 class StreamFilter {
  public:

@@ -251,6 +251,11 @@ Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
     if (plan_.range) {
       source.from = plan_.range->first;
       source.until = plan_.range->last;
+      // To skip samples costs a copy of each.
+      SampleInfo info;
+      if (source.reader.find(*source.from, info) == ReadStatus::ok) {
+        source.reader.seek(info.tid - 1);
+      }
     }
   }
   return source;

@@ -41,7 +41,7 @@ constexpr unsigned char kPlaybackState = 5;
 // Of a client.
 constexpr unsigned char kPlaybackControl = 3;
 
-// Of a recording, in one turn.
+// Of a recording, or of all rings, in one turn.
 constexpr int kMaxPlayedSamples = 2000;
 constexpr float kMaxSpeed = 1000;
 
@@ -83,7 +83,7 @@ class FoxgloveConnection : public Connection {
       playback_.emplace(clients_.range_.value_or(TimeRange{}), recording);
     } else if (peer_.path() == FoxgloveClients::kHoldPath) {
       if (!clients_.range_) {
-        peer_.close("the rings hold no sample yet");
+        peer_.close("the rings hold nothing, or that is not known yet: connect again");
         return;
       }
       playback_.emplace(*clients_.range_, nullptr);
@@ -185,18 +185,23 @@ class FoxgloveConnection : public Connection {
     }
     if (now >= next_time_ && peer_.waiting_bytes() < kMaxWaitingBytes) {
       next_time_ = now + kTimePeriod;
-      const auto* clock = std::get_if<PlaybackClock>(&clients_.played_);
       std::vector<std::byte> message;
       put(message, kTime);
-      put(message, clock ? static_cast<std::uint64_t>(std::max(clock->now_s(), 0.0) * 1e9)
-                         : recording::log_time_of(playback_->position));
+      if (playback_) {
+        put(message, recording::log_time_of(playback_->position));
+      } else {
+        const double now_s = std::get<PlaybackClock>(clients_.played_).now_s();
+        put(message, static_cast<std::uint64_t>(std::max(now_s, 0.0) * 1e9));
+      }
       peer_.send(Message::binary({message}));
     }
     if (left_out_ > 0 && now >= next_report_) {
       next_report_ = now + kLossReportPeriod;
-      report(1, fmt::format("{} samples were left out: this client or the network to it is slower "
-                            "than the streams",
-                            std::exchange(left_out_, 0)));
+      report(1,
+             fmt::format("{} samples were left out: {}", std::exchange(left_out_, 0),
+                         playback_ ? "they were overwritten, came too late, or are of another type"
+                                   : "this client or the network to it is slower than the "
+                                     "streams"));
     }
   }
 
@@ -205,7 +210,7 @@ class FoxgloveConnection : public Connection {
     std::uint32_t channel = 0;
     Tid next = kNoTid;  // kNoTid: from the newest on
     std::uint64_t incarnation = 0;
-    bool wants_present = true;  // of a recording: it has not got a sample of the position yet
+    bool wants_present = true;  // of a playback: it has not got a sample of the position yet
   };
 
   // Where this client is in the recording, or in what the rings held when it connected.
@@ -215,13 +220,14 @@ class FoxgloveConnection : public Connection {
       if (!recording) return;
       cursor = recording->cursor();
       for (const RecordedStreamInfo& stream : recording->streams()) {
-        names.push_back(stream.id.str());
+        streams.emplace_back(stream.id.str(), stream.type);
       }
     }
     bool is_ended() const { return position >= end; }
 
     std::optional<RecordingCursor> cursor;  // none: of the rings
-    std::vector<std::string> names;         // of the streams, by their indices in the recording
+    // Names and types of the streams, by their indices in the recording.
+    std::vector<std::pair<std::string, TypeInfo>> streams;
     Time begin{}, end{};
     Time position{};                     // what is before it was sent
     std::optional<RecordedSample> next;  // the cursor's, which is not due yet
@@ -279,6 +285,7 @@ class FoxgloveConnection : public Connection {
 
   void play(MonoTime now) {
     for (auto& [id, subscription] : subscriptions_) {
+      if (peer_.waiting_bytes() >= kMaxWaitingBytes) return;
       if (subscription.wants_present) send_present(id, subscription);
     }
     Playback& playback = *playback_;
@@ -300,10 +307,10 @@ class FoxgloveConnection : public Connection {
   // Sends what comes until that time, and returns it; or a time before what is sent later.
   Time play_recording(Time until) {
     Playback& playback = *playback_;
-    std::map<std::string, std::vector<std::uint32_t>> subscribers;
+    std::map<std::string, std::uint32_t> subscriptions;  // by the streams
     for (const auto& [id, subscription] : subscriptions_) {
       const auto channel = clients_.channels_.find(subscription.channel);
-      if (channel != clients_.channels_.end()) subscribers[channel->second.stream].push_back(id);
+      if (channel != clients_.channels_.end()) subscriptions[channel->second.stream] = id;
     }
     for (int i = 0;; ++i) {
       if (!playback.next) {
@@ -316,11 +323,14 @@ class FoxgloveConnection : public Connection {
       if (i == kMaxPlayedSamples || peer_.waiting_bytes() >= kMaxWaitingBytes) {
         return ctl::saturating_add(sample.info.time, -Duration(1));
       }
-      const auto found = subscribers.find(playback.names[sample.stream]);
-      if (found != subscribers.end()) {
-        for (const std::uint32_t id : found->second) {
-          send_sample(id, clients_.channels_.at(subscriptions_.at(id).channel), sample.info,
-                      sample.payload);
+      const auto& [name, type] = playback.streams[sample.stream];
+      if (const auto found = subscriptions.find(name); found != subscriptions.end()) {
+        const auto& channel = clients_.channels_.at(subscriptions_.at(found->second).channel);
+        // An earlier incarnation may have another type than the channel.
+        if (type == channel.type) {
+          send_sample(found->second, channel, sample.info, sample.payload);
+        } else {
+          ++left_out_;
         }
       }
       playback.next.reset();
@@ -335,27 +345,43 @@ class FoxgloveConnection : public Connection {
     Tid tid;
   };
 
+  // The reader of the stream, if it is open and of the type of the channel.
+  RawReader* reader_of(const FoxgloveClients::Channel& channel) {
+    OpenStream* const stream = clients_.streams_.find(channel.stream).stream;
+    if (!stream) return nullptr;
+    auto& reader = std::get<RawReader>(stream->reader);
+    return reader.incarnation() == channel.incarnation ? &reader : nullptr;
+  }
+
   // Of each subscription the samples after the last one sent, until `until`, or until there are
   // many; then `until` is before the others.
   std::vector<Due> due_of_rings(Time& until) {
     std::vector<Due> due;
+    const std::size_t share = std::max<std::size_t>(
+        kMaxPlayedSamples / std::max<std::size_t>(subscriptions_.size(), 1), 8);
     for (auto& [id, subscription] : subscriptions_) {
       const auto channel = clients_.channels_.find(subscription.channel);
       if (channel == clients_.channels_.end()) continue;
-      OpenStream* const stream = clients_.streams_.find(channel->second.stream).stream;
-      if (!stream) continue;
-      const RawReader& reader = std::get<RawReader>(stream->reader);
+      RawReader* const reader = reader_of(channel->second);
+      if (!reader) continue;
       SampleInfo info;
       if (subscription.next == kNoTid) {
-        const bool is_found = reader.find(playback_->position, info) == ReadStatus::ok;
-        subscription.next = is_found ? info.tid + 1 : 0;
+        const ReadStatus found = reader->find(playback_->position, info);
+        // Else it is still on its way, or may not be read by time.
+        if (found != ReadStatus::ok && found != ReadStatus::too_old) continue;
+        subscription.next = found == ReadStatus::ok ? info.tid + 1 : 0;
       }
       // What is older was overwritten meanwhile.
-      Tid tid = subscription.next = std::max(subscription.next, reader.oldest_tid());
-      for (int i = 0; i < kMaxPlayedSamples; ++i, ++tid) {
-        if (reader.read_info(tid, info) != ReadStatus::ok || info.time > until) break;
+      subscription.next = std::max(subscription.next, reader->oldest_tid());
+      const Tid end = reader->newest_tid() + 1;
+      std::size_t taken = 0;
+      for (Tid tid = subscription.next; tid < end && taken < share; ++tid) {
+        const ReadStatus status = reader->read_info(tid, info);
+        if (status == ReadStatus::arriving || (status == ReadStatus::ok && info.time > until))
+          break;
+        if (status != ReadStatus::ok) continue;  // it was lost
         due.push_back({info.time, id, tid});
-        if (i == kMaxPlayedSamples - 1) until = info.time;
+        if (++taken == share) until = info.time;
       }
     }
     std::erase_if(due, [&](const Due& one) { return one.time > until; });
@@ -365,15 +391,19 @@ class FoxgloveConnection : public Connection {
 
   Time play_rings(Time until) {
     for (const Due& due : due_of_rings(until)) {
-      if (peer_.waiting_bytes() >= kMaxWaitingBytes)
+      if (peer_.waiting_bytes() >= kMaxWaitingBytes) {
         return ctl::saturating_add(due.time, -Duration(1));
+      }
       Subscription& subscription = subscriptions_.at(due.subscription);
       const FoxgloveClients::Channel& channel = clients_.channels_.at(subscription.channel);
-      RawReader& reader =
-          std::get<RawReader>(clients_.streams_.find(channel.stream).stream->reader);
-      BorrowedSample sample;
       subscription.next = due.tid + 1;
-      if (reader.borrow(due.tid, sample) != ReadStatus::ok) continue;
+      // What it had arrived late, or it restarts.
+      RawReader* const reader = due.time <= playback_->position ? nullptr : reader_of(channel);
+      BorrowedSample sample;
+      if (!reader || reader->borrow(due.tid, sample) != ReadStatus::ok) {
+        ++left_out_;
+        continue;
+      }
       Message message =
           sample_message(due.subscription, channel.type, sample.info(), sample.payload());
       if (sample.still_valid()) peer_.send(std::move(message));
@@ -398,7 +428,7 @@ class FoxgloveConnection : public Connection {
                                        : read(std::get<RawReader>(found.stream->reader));
     if (status == ReadStatus::arriving || status == ReadStatus::restarted) return;  // soon
     subscription.wants_present = false;
-    if (status == ReadStatus::ok) {
+    if (status == ReadStatus::ok && found.stream->type() == channel->second.type) {
       send_sample(id, channel->second, info, std::span(payload).first(info.payload_bytes));
     }
   }
@@ -436,8 +466,13 @@ class FoxgloveConnection : public Connection {
         report(2, "a subscription names a channel that does not exist");
       } else if (subscriptions_.size() >= kMaxSubscriptions) {
         report(2, "too many subscriptions");
-      } else if (!subscriptions_.emplace(*id, Subscription{*channel, kNoTid, 0, true}).second) {
-        report(1, fmt::format("there is a subscription {} already", *id));
+      } else if (std::ranges::any_of(subscriptions_, [&](const auto& numbered) {
+                   return numbered.first == *id || numbered.second.channel == *channel;
+                 })) {
+        report(1, fmt::format("there is a subscription {}, or one to channel {}, already", *id,
+                              *channel));
+      } else {
+        subscriptions_.emplace(*id, Subscription{*channel, kNoTid, 0, true});
       }
     }
   }
@@ -497,7 +532,7 @@ class FoxgloveConnection : public Connection {
   Peer& peer_;
   std::set<std::uint32_t> advertised_;                   // channels
   std::map<std::uint32_t, Subscription> subscriptions_;  // by the client's ids
-  std::optional<Playback> playback_;                     // of a recording
+  std::optional<Playback> playback_;                     // of a recording, or at kHoldPath
   bool wants_graph_ = false;
   std::uint64_t left_out_ = 0;  // samples, since the last report
   MonoTime next_time_{}, next_report_{};

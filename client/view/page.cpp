@@ -312,6 +312,7 @@ Result<WantedRange> wanted_range(const Json& request) {
   WantedRange range;
   if (request.contains("streams")) {
     range.streams = DSSM_TRY(texts_of(request, "streams", kMaxSavedStreams));
+    if (range.streams.empty()) return bad_request("'streams' is to name some, or to be left out");
   }
   const std::optional<Time> from = DSSM_TRY(time_of(request, "from_ns"));
   const std::optional<Time> to = DSSM_TRY(time_of(request, "to_ns"));

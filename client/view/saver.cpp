@@ -1,8 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "client/view/saver.hpp"
 
+#include <fcntl.h>
 #include <fmt/format.h>
 #include <stdlib.h>
+#include <sys/file.h>
+#include <unistd.h>
 
 #include <cerrno>
 #include <memory>
@@ -35,6 +38,8 @@ Saver::Saver(Session session, Server& server) : session_(std::move(session)), se
     return;
   }
   folder_ = name;
+  lock_ = ::open(name.c_str(), O_RDONLY | O_DIRECTORY | O_CLOEXEC);
+  ::flock(lock_, LOCK_SH | LOCK_NB);
   server_.serve_folder(kSavedPath, folder_, ".mcap", "application/octet-stream");
 }
 
@@ -43,6 +48,7 @@ Saver::~Saver() {
   worker_.reset();
   std::error_code ignored;
   if (!folder_.empty()) std::filesystem::remove_all(folder_, ignored);
+  if (lock_ >= 0) ::close(lock_);
 }
 
 void Saver::save(WantedRange range, Done done) {
@@ -51,16 +57,21 @@ void Saver::save(WantedRange range, Done done) {
     return done(Error{Errc::conflict, "another range is being saved; try again in a moment"});
   }
   is_saving_ = true;
+  std::error_code ignored;
+  if (saved_.size() == kMaxFiles) {
+    std::filesystem::remove_all(saved_.front(), ignored);
+    saved_.pop_front();
+  }
   worker_->add([this, range = std::move(range), done = std::move(done), number = ++last_number_] {
     const Result<SavedRange> saved = record(range, number);
     server_.post([this, saved, done, number] {
       is_saving_ = false;
-      saved_.push_back(folder_ / std::to_string(number));
-      std::error_code ignored;
-      if (!saved) std::filesystem::remove_all(saved_.back(), ignored);
-      if (saved_.size() > kMaxFiles) {
-        std::filesystem::remove_all(saved_.front(), ignored);
-        saved_.pop_front();
+      const std::filesystem::path folder = folder_ / std::to_string(number);
+      if (saved) {
+        saved_.push_back(folder);
+      } else {
+        std::error_code unused;
+        std::filesystem::remove_all(folder, unused);
       }
       done(saved);
     });
@@ -68,7 +79,9 @@ void Saver::save(WantedRange range, Done done) {
 }
 
 Result<SavedRange> Saver::record(const WantedRange& range, std::uint64_t number) {
-  ctl::RecorderPlan plan{ctl::StreamFilter({}, range.streams), {}, {}, {}, false};
+  std::vector<std::string> patterns;
+  for (const std::string& name : range.streams) patterns.push_back(ctl::pattern_of(name));
+  ctl::RecorderPlan plan{ctl::StreamFilter({}, std::move(patterns)), {}, {}, {}, false};
   plan.range = {range.first, range.last};
   const std::filesystem::path folder = folder_ / std::to_string(number);
   const std::string name = ctl::recording_name(WallClock::now());
@@ -85,6 +98,10 @@ Result<SavedRange> Saver::record(const WantedRange& range, std::uint64_t number)
   while (true) {
     DSSM_TRY(recorder->take());
     if (is_ending_) return Error{Errc::unavailable, "dssm-view ends"};
+    if (std::filesystem::space(folder, failed).available < kFreeBytes) {
+      return Error{Errc::no_memory,
+                   fmt::format("the disk of '{}' has less than 1 GiB left", folder_.string())};
+    }
     if (recorder->has_past()) break;
     if (recorder->is_past_late()) {
       saved.notices.emplace_back("not all of the past has come; is another host slow or silent?");

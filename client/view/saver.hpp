@@ -44,13 +44,14 @@ class Saver {
   ~Saver();  // ends what is being saved
 
   // Calls `done` in the server's thread, which is the one that calls this, with the result.
-  //   fails  conflict (another range is being saved), no_memory (the disk is full), no_permission,
-  //          unavailable (dssmd does not answer), system
+  //   fails  conflict (another range is being saved), no_memory (the disk has less than 1 GiB
+  //          left), no_permission, unavailable (dssmd does not answer), system
   using Done = std::function<void(const Result<SavedRange>&)>;
   void save(WantedRange range, Done done);
 
  private:
-  static constexpr std::size_t kMaxFiles = 4;  // with more, the oldest is deleted
+  static constexpr std::size_t kMaxFiles = 4;             // with more, the oldest is deleted
+  static constexpr std::uintmax_t kFreeBytes = 1U << 30;  // of the disk; what others need
 
   Result<SavedRange> record(const WantedRange& range, std::uint64_t number);  // the worker's
 
@@ -58,6 +59,7 @@ class Saver {
   Server& server_;
   std::optional<Error> folder_error_;
   std::filesystem::path folder_;  // empty: there is none
+  int lock_ = -1;                 // of the folder: systemd-tmpfiles leaves it alone
   bool is_saving_ = false;
   std::uint64_t last_number_ = 0;
   std::deque<std::filesystem::path> saved_;  // folders with one recording each

@@ -16,7 +16,11 @@
 #include <array>
 #include <cerrno>
 #include <cstring>
+#include <map>
+#include <memory>
+#include <string>
 #include <system_error>
+#include <tuple>
 #include <utility>
 
 #include "client/dssmctl/text.hpp"
@@ -154,45 +158,48 @@ struct Server::Library {
 };
 
 // The files of TLS, and what is made of them.
-struct Server::Credentials {
+class Server::Credentials {
+ public:
   explicit Credentials(const ServerOptions& options) : options_(options) {}
 
-  // Whether a file is another one than at the last call, the first one included.
-  bool have_changed() {
-    std::vector<std::pair<ino_t, std::int64_t>> stamps;
-    for (const std::filesystem::path& file :
-         {options_.certificate, options_.key, options_.authority, options_.revoked}) {
-      struct stat status {};
-      ::stat(file.c_str(), &status);
-      stamps.emplace_back(status.st_ino,
-                          status.st_mtim.tv_sec * 1'000'000'000 + status.st_mtim.tv_nsec);
-    }
-    return std::exchange(stamps_, stamps) != stamps;
-  }
-
-  // Checks all, then has `tls` use them, if there is one, for the handshakes from then on.
+  // Reads the files and checks them together. If all are right, `tls` uses them, if there is one,
+  // for the handshakes from then on.
   Result<void> load() {
-    const std::unique_ptr<SSL_CTX, Free<SSL_CTX_free>> trial(SSL_CTX_new(TLS_server_method()));
-    DSSM_TRY(load_certificate(trial.get()));
+    is_loaded_ = false;
+    stamps_ = stamps();
+    const std::unique_ptr<SSL_CTX, Free<SSL_CTX_free>> files(SSL_CTX_new(TLS_server_method()));
+    if (SSL_CTX_use_certificate_chain_file(files.get(), options_.certificate.c_str()) != 1) {
+      return failed(options_.certificate, "holds no certificate in PEM form");
+    }
+    if (SSL_CTX_use_PrivateKey_file(files.get(), options_.key.c_str(), SSL_FILETYPE_PEM) != 1 ||
+        SSL_CTX_check_private_key(files.get()) != 1) {
+      return failed(options_.key, "holds no private key in PEM form, or not that of --certificate");
+    }
     std::unique_ptr<X509_STORE, Free<X509_STORE_free>> store(X509_STORE_new());
     if (!options_.authority.empty() &&
         X509_STORE_load_file(store.get(), options_.authority.c_str()) != 1) {
       return failed(options_.authority, "holds no certificate in PEM form");
     }
-    if (!options_.revoked.empty()) {
-      X509_LOOKUP* const lookup = X509_STORE_add_lookup(store.get(), X509_LOOKUP_file());
-      if (X509_load_crl_file(lookup, options_.revoked.c_str(), X509_FILETYPE_PEM) <= 0) {
-        return failed(options_.revoked, "holds no revocation list in PEM form");
-      }
-      X509_STORE_set_flags(store.get(), X509_V_FLAG_CRL_CHECK | X509_V_FLAG_CRL_CHECK_ALL);
-    }
-    if (!tls) return {};
-    DSSM_TRY(load_certificate(tls));
-    SSL_CTX_set_cert_store(tls, store.release());
+    if (!options_.revoked.empty()) DSSM_TRY(load_revoked(store.get()));
+    if (tls) DSSM_TRY(use(files.get()));
+    if (tls) SSL_CTX_set_cert_store(tls, store.release());
+    is_loaded_ = true;
+    ++generation_;
     return {};
   }
+  // Also after a failure: permissions are no property of the files' contents.
+  bool is_to_load() const { return !is_loaded_ || stamps() != stamps_; }
 
-  SSL_CTX* tls = nullptr;  // libwebsockets'
+  // A connection whose handshake was with earlier files may not go on.
+  void begin(lws* connection) { connections_[connection] = generation_; }
+  void end(lws* connection) { connections_.erase(connection); }
+  bool is_outdated(lws* connection) const {
+    const auto found = connections_.find(connection);
+    return found != connections_.end() && found->second != generation_;
+  }
+
+  SSL_CTX* tls = nullptr;        // libwebsockets'
+  std::string reported_failure;  // the last one, since files were loaded
 
  private:
   template <auto function>
@@ -202,31 +209,77 @@ struct Server::Credentials {
       function(object);
     }
   };
+  using Stamp = std::tuple<ino_t, std::int64_t, std::int64_t>;
+
+  std::vector<Stamp> stamps() const {
+    const auto ns_of = [](const timespec& time) {
+      return time.tv_sec * 1'000'000'000 + time.tv_nsec;
+    };
+    std::vector<Stamp> stamps;
+    for (const std::filesystem::path& file :
+         {options_.certificate, options_.key, options_.authority, options_.revoked}) {
+      struct stat status {};
+      ::stat(file.c_str(), &status);
+      stamps.emplace_back(status.st_ino, ns_of(status.st_mtim), ns_of(status.st_ctim));
+    }
+    return stamps;
+  }
 
   static Error failed(const std::filesystem::path& file, std::string_view what) {
     ERR_clear_error();
-    struct stat status {};
-    if (::stat(file.c_str(), &status) != 0 || ::access(file.c_str(), R_OK) != 0) {
+    if (::access(file.c_str(), R_OK) != 0) {
       return {Errc::system,
               fmt::format("read '{}': {}", file.string(), std::generic_category().message(errno))};
     }
     return {Errc::invalid_argument, fmt::format("'{}' {}", file.string(), what)};
   }
 
-  Result<void> load_certificate(SSL_CTX* context) const {
-    if (SSL_CTX_use_certificate_chain_file(context, options_.certificate.c_str()) != 1) {
-      return failed(options_.certificate, "holds no certificate in PEM form");
+  // Of each CA in `store` a list is needed: without one OpenSSL refuses all its certificates.
+  Result<void> load_revoked(X509_STORE* store) const {
+    X509_LOOKUP* const lookup = X509_STORE_add_lookup(store, X509_LOOKUP_file());
+    if (X509_load_crl_file(lookup, options_.revoked.c_str(), X509_FILETYPE_PEM) <= 0) {
+      return failed(options_.revoked, "holds no revocation list in PEM form");
     }
-    if (SSL_CTX_use_PrivateKey_file(context, options_.key.c_str(), SSL_FILETYPE_PEM) != 1) {
-      return failed(options_.key,
-                    "holds no private key in PEM form, or that of another "
-                    "certificate than --certificate");
+    X509_STORE_set_flags(store, X509_V_FLAG_CRL_CHECK | X509_V_FLAG_CRL_CHECK_ALL);
+    std::vector<const X509_NAME*> authorities, issuers;
+    STACK_OF(X509_OBJECT)* const objects = X509_STORE_get0_objects(store);
+    for (int i = 0; i < sk_X509_OBJECT_num(objects); ++i) {
+      X509_OBJECT* const object = sk_X509_OBJECT_value(objects, i);
+      if (const X509* const authority = X509_OBJECT_get0_X509(object)) {
+        authorities.push_back(X509_get_subject_name(authority));
+      } else if (X509_OBJECT_get_type(object) == X509_LU_CRL) {
+        issuers.push_back(X509_CRL_get_issuer(X509_OBJECT_get0_X509_CRL(object)));
+      }
+    }
+    const bool has_all = std::ranges::all_of(authorities, [&](const X509_NAME* authority) {
+      return std::ranges::any_of(
+          issuers, [&](const X509_NAME* issuer) { return X509_NAME_cmp(issuer, authority) == 0; });
+    });
+    if (has_all) return {};
+    return failed(options_.revoked, "has no list of one of the CAs in --authority; each needs one");
+  }
+
+  // The certificate and key of `files`, in place of those of `tls`.
+  Result<void> use(SSL_CTX* files) const {
+    EVP_PKEY* const key = SSL_CTX_get0_privatekey(files);
+    const EVP_PKEY* const used = SSL_CTX_get0_privatekey(tls);
+    // OpenSSL would keep the one of another kind beside it.
+    if (used && EVP_PKEY_get_base_id(key) != EVP_PKEY_get_base_id(used)) {
+      return failed(options_.key, "is of another kind than before (RSA, EC): restart dssm-view");
+    }
+    STACK_OF(X509)* chain = nullptr;
+    SSL_CTX_get0_chain_certs(files, &chain);
+    if (SSL_CTX_use_cert_and_key(tls, SSL_CTX_get0_certificate(files), key, chain, 1) != 1) {
+      return failed(options_.certificate, "cannot be used");
     }
     return {};
   }
 
   const ServerOptions& options_;
-  std::vector<std::pair<ino_t, std::int64_t>> stamps_;
+  std::vector<Stamp> stamps_;  // of the files when they were read
+  bool is_loaded_ = false;
+  std::uint64_t generation_ = 0;
+  std::map<lws*, std::uint64_t> connections_;
 };
 
 struct Server::Timer {
@@ -348,7 +401,6 @@ Result<std::uint16_t> Server::listen() {
   info.fd_limit_per_thread = kMaxDescriptors;
   if (!options_.certificate.empty()) {
     credentials_ = std::make_unique<Credentials>(options_);
-    credentials_->have_changed();
     DSSM_TRY(credentials_->load());
     repeat(kCredentialsPeriod, [this] { follow_credentials(); });
     library.certificate = options_.certificate.string();
@@ -424,6 +476,9 @@ void Server::stop() noexcept {
 }
 
 std::string Server::refusal(lws* connection) const {
+  if (credentials_ && credentials_->is_outdated(connection)) {
+    return "the certificates were read again; connect again";
+  }
   const std::string host = header(connection, WSI_TOKEN_HOST);
   const std::string name = lower_case(std::string(without_port(host)));
   const std::string own = this_pc(), short_own = own.substr(0, own.find('.'));
@@ -452,6 +507,12 @@ int Server::on_event(lws* connection, int reason, void* user, void* in, std::siz
     SSL_CTX_set_num_tickets(tls, 0);
     SSL_CTX_set_session_cache_mode(tls, SSL_SESS_CACHE_OFF);
     return 0;
+  }
+  if (server.credentials_ && reason == LWS_CALLBACK_SERVER_NEW_CLIENT_INSTANTIATED) {
+    server.credentials_->begin(connection);
+  }
+  if (server.credentials_ && reason == LWS_CALLBACK_WSI_DESTROY) {
+    server.credentials_->end(connection);
   }
   const lws_protocols* protocol = lws_get_protocol(connection);
   if (reason == LWS_CALLBACK_EVENT_WAIT_CANCELLED) {  // comes once for each protocol
@@ -482,14 +543,19 @@ int Server::on_event(lws* connection, int reason, void* user, void* in, std::siz
 }
 
 void Server::follow_credentials() {
-  if (!credentials_->have_changed()) return;
+  if (!credentials_->is_to_load()) return;
   if (const Result<void> loaded = credentials_->load(); !loaded) {
+    if (std::exchange(credentials_->reported_failure, loaded.error().message) ==
+        loaded.error().message) {
+      return;
+    }
     std::fputs(fmt::format("dssm-view: the certificates are used as they were: {}\n",
                            ctl::escaped_message(loaded.error().message))
                    .c_str(),
                stderr);
     return;
   }
+  credentials_->reported_failure.clear();
   std::fputs("dssm-view: the certificates were read again\n", stderr);
   // Who is there still may be revoked; the others connect again.
   for (WebSocket* socket : websockets_) socket->peer.close("the certificates were read again");

@@ -139,7 +139,7 @@ class Server {
 
  private:
   struct Library;  // what libwebsockets needs as long as its context lives
-  struct Credentials;
+  class Credentials;
   struct Timer;
   struct WebSocket;
   struct Text {

@@ -49,7 +49,8 @@ Json streams_json(const std::vector<StreamInfo>& streams, std::optional<TimeRang
     json["newest_ns"] = oldest ? time_json(stream.newest_time) : Json();
     json["mirror"] = stream.mirror ? ctl::mirror_json(*stream.mirror) : Json();
     list.push_back(std::move(json));
-    if (oldest) extend(range, *oldest, stream.newest_time);
+    // Incidents stay in their ring for ever.
+    if (oldest && !ctl::is_of_black_box(stream.id)) extend(range, *oldest, stream.newest_time);
   }
   return list;
 }
@@ -247,6 +248,12 @@ void StateCollector::find_events(const std::vector<HostInfo>& hosts) {
   }
   hosts_ = std::move(new_hosts);
 
+  std::erase_if(incidents_, [&](const auto& named) {
+    return named.second.restart_error() ||
+           std::ranges::none_of(state_.streams, [&](const StreamInfo& stream) {
+             return stream.id.str() == named.first;
+           });
+  });
   std::map<std::string, StreamState> new_streams;
   for (const StreamInfo& stream : state_.streams) {
     if (stream.id.name == ctl::kIncidentStream) find_incidents(stream);

@@ -18,7 +18,7 @@ Result<std::vector<std::byte>> recorded_property(const Recording& recording, con
   std::optional<std::size_t> stream, index;
   for (std::size_t i = 0; i < recording.streams().size(); ++i) {
     const RecordedStreamInfo& one = recording.streams()[i];
-    const bool is_later = stream && t && one.first_time > *t;  // an incarnation
+    const bool is_later = stream && t && one.samples > 0 && one.first_time > *t;  // an incarnation
     if (one.id != id || is_later) continue;
     stream = i;
     index.reset();
@@ -26,7 +26,10 @@ Result<std::vector<std::byte>> recorded_property(const Recording& recording, con
       index = t ? one.property_at(*t) : one.property_times.size() - 1;
     }
   }
-  if (index) return recording.property(*stream, *index);
+  if (index) {
+    std::vector<std::byte> property = DSSM_TRY(recording.property(*stream, *index));
+    if (!property.empty()) return property;
+  }
   return Error{Errc::not_found, fmt::format("'{}' has no property then", id.str())};
 }
 
@@ -99,11 +102,23 @@ Result<OpenStream> Streams::open_in_source(const StreamId& id) {
 void Streams::ask_property(const std::string& name, std::optional<Time> t, PropertyDone done) {
   const Result<StreamId> id = StreamId::parse(name);
   if (!id) return done(id.error());
-  worker_.add([this, id = *id, t, done = std::move(done)] {
+  const std::pair key(name, t);
+  if (!properties_.contains(key) && properties_.size() >= kMaxProperties) {
+    return done(Error{Errc::limit_exceeded, "too many properties are asked for; try again"});
+  }
+  std::vector<PropertyDone>& waiting = properties_[key];
+  waiting.push_back(std::move(done));
+  if (waiting.size() > 1) return;
+  property_worker_.add([this, id = *id, key] {
     auto* const session = std::get_if<Session>(&source_);
     const Result<std::vector<std::byte>> property =
-        session ? session->property(id) : recorded_property(std::get<Recording>(source_), id, t);
-    server_.post([property, done] { done(property); });
+        session ? session->property(id)
+                : recorded_property(std::get<Recording>(source_), id, key.second);
+    server_.post([this, property, key] {
+      const std::vector<PropertyDone> all = std::move(properties_[key]);
+      properties_.erase(key);
+      for (const PropertyDone& call : all) call(property);
+    });
   });
 }
 

@@ -65,7 +65,8 @@ class Streams {
   // Calls `done`, in this thread, with the property that the stream has; of a recording, had at `t`
   // (empty: at its end).
   //   fails  invalid_argument (not a stream's name), not_found (no such stream, or no property),
-  //          and as Session::property() and Recording::property()
+  //          limit_exceeded (too many are asked for), and as Session::property() and
+  //          Recording::property()
   using PropertyDone = std::function<void(const Result<std::vector<std::byte>>&)>;
   void ask_property(const std::string& name, std::optional<Time> t, PropertyDone done);
 
@@ -75,7 +76,8 @@ class Streams {
  private:
   static constexpr Duration kUnusedTime = std::chrono::seconds(30);
   static constexpr Duration kRetryPeriod = std::chrono::seconds(1);
-  static constexpr std::size_t kMaxStreams = 4096;  // that were asked for lately
+  static constexpr std::size_t kMaxStreams = 4096;   // that were asked for lately
+  static constexpr std::size_t kMaxProperties = 64;  // that are asked for
 
   struct Entry {
     std::optional<OpenStream> stream;
@@ -90,7 +92,10 @@ class Streams {
   Source source_;
   Server& server_;
   std::map<std::string, Entry> entries_;
+  // Those who wait for a property, by its stream and time.
+  std::map<std::pair<std::string, std::optional<Time>>, std::vector<PropertyDone>> properties_;
   Worker worker_;
+  Worker property_worker_;  // a host that does not answer does not keep streams from being opened
 };
 
 }  // namespace dssm::view

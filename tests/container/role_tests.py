@@ -290,6 +290,9 @@ class IsolatedTests:
         wait_until(lambda: '"host":"pc1"' in get(self.container,
                                                  prometheus + "query?query=dssm_host_up"),
                    "Prometheus has no metrics")
+        assert self.playbooks.run("site.yml", dssm_packages=packages) > 0
+        wait_until(lambda: "<title>" in get(self.container, "http://127.0.0.1:8765/"),
+                   "it does not listen where it does by default")
 
     def listen(self) -> None:
         """Test."""

@@ -432,6 +432,10 @@ export class HexView {
     box.append(this.text);
   }
 
+  clear() {
+    setText(this.text, "");
+  }
+
   show({ payload }) {
     const lines = [];
     const end = Math.min(payload.byteLength, kMaxDump);

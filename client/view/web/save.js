@@ -34,7 +34,7 @@ export class SaveDialog {
     this.dialog.showModal();
   }
 
-  // What may be saved: {text, from, to}; to: null for now.
+  // What may be saved: {text, from, to}, or {text, last} of so long before the newest sample.
   ranges() {
     const seconds = (count) => BigInt(count) * 1000000000n;
     const { time, signals } = this;
@@ -50,8 +50,7 @@ export class SaveDialog {
     }
     if (time.range) {
       for (const length of kLengths) {
-        const from = time.range.newest - seconds(length);
-        choices.push({ text: `the last ${wholeDuration(length)}`, from, to: null });
+        choices.push({ text: `the last ${wholeDuration(length)}`, last: seconds(length) });
       }
     }
     choices.push({ text: "all that the rings hold", from: 0n, to: null });
@@ -59,7 +58,8 @@ export class SaveDialog {
   }
 
   async save() {
-    const { from, to } = this.choices[Number(this.range.value)];
+    const { last, from = this.time.range.newest - last, to = null } =
+      this.choices[Number(this.range.value)];
     const parameters = { from_ns: String(from), to_ns: to === null ? null : String(to) };
     if (this.streams.value === "shown") parameters.streams = this.page().chosenStreams();
     this.button.disabled = true;

@@ -246,6 +246,7 @@ class Card {
   rebuild() {
     this.drawing?.close?.();
     this.drawing = null;
+    this.propertyAt = -Infinity;
     if (!this.type) return;
     const guessed = guessKind(this.type);
     this.kindBox.replaceChildren(
@@ -269,6 +270,7 @@ class Card {
     };
     this.body.replaceChildren();
     this.drawing = makers[kind]();
+    if (kind === "property") this.views.pump.wake();
     this.trailLabel.hidden = !this.poseStream();
     this.placeLabel.hidden = kind !== "scan" || this.placeBox.options.length < 2;
     if (this.samples) this.show(this.t, this.samples);
@@ -406,6 +408,7 @@ class Card {
       setText(this.note, "");
     } catch (error) {
       if (!(error instanceof RequestError)) throw error;
+      if (drawing === this.drawing) drawing.clear();
       setText(this.note, error.message);
     }
   }

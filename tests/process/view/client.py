@@ -27,6 +27,7 @@ import websockets
 PAGE = "dssm.view.v1"
 FOXGLOVE = "foxglove.sdk.v1"
 MESSAGE_DATA = 1
+TIME = 2
 PLAYBACK_CONTROL = 3
 PLAYBACK_STATE = 5
 
@@ -121,6 +122,7 @@ async def play(url):
         assert "playbackControl" in info["capabilities"]
         begin, end = ("{sec}.{nsec:09}".format(**info[key]) for key in ["dataStartTime", "dataEndTime"])
         print("from", begin, "to", end)
+        begin_ns, end_ns = (int(time.replace(".", "")) for time in (begin, end))
         channels = (await receive())["channels"]
         for channel in channels:
             topics[channel["id"]] = channel["topic"]
@@ -146,6 +148,8 @@ async def play(url):
                     answered = answered or answer == str(number)
                     if name == "ended":
                         break
+                elif message[0] == TIME:
+                    assert begin_ns <= struct.unpack_from("<Q", message, 1)[0] <= end_ns
                 elif message[0] == MESSAGE_DATA and answered:
                     channel, time = struct.unpack_from("<IQ", message, 1)
                     samples[topics[channel]].append(time)
@@ -155,6 +159,8 @@ async def play(url):
                 if command == "pause":
                     print(topic, times[0])
                     continue
+                # Before that only what the stream had then.
+                assert sum(time < int(seek_ns) for time in times) <= 1
                 times = [time for time in times if time >= int(seek_ns)]
                 print("played", topic, len(set(times)), "in order" if times == sorted(times) else "wild")
 

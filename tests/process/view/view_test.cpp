@@ -40,7 +40,7 @@ class View : public ViewTest {
              "answer = client.getresponse()\n"
              "print(answer.status)\n"
              "print(answer.getheader('content-type'))\n"
-             "print(answer.read().decode())\n",
+             "print(answer.read().decode(errors='replace'))\n",
              url_, path, header, value});
     EXPECT_EQ(finished.exit_status, 0) << finished.err;
     return {std::atoi(finished.out.c_str()), finished.out};
@@ -365,6 +365,16 @@ TEST_F(View, SavesARangeAsARecording) {
   EXPECT_EQ(one["samples"], 100) << one;
 
   EXPECT_TRUE(contains(ask({{"op", "save"}})["error"].dump(), "'from_ns'"));
+  // Names are not patterns.
+  const auto samples_of = [&](const std::string& name) {
+    return ask({{"op", "save"}, {"streams", {name}}, {"from_ns", "0"}})["samples"];
+  };
+  EXPECT_EQ(samples_of("*"), 0);
+  // With a fifth one the first is gone.
+  EXPECT_EQ(get(path).first, 200);
+  EXPECT_EQ(samples_of("lidar:0@pc2"), 100);
+  EXPECT_EQ(samples_of("lidar:0@pc2"), 100);
+  EXPECT_EQ(get(path).first, 404);
   EXPECT_EQ(get(path.substr(0, path.rfind('/'))).first, 404);
   EXPECT_EQ(get("/saved/../../../etc/passwd").first, 404);
   EXPECT_EQ(get("/saved/%2e%2e/%2e%2e/%2e%2e/etc/passwd").first, 404);
@@ -384,7 +394,7 @@ TEST_F(View, GivesTheProperty) {
   EXPECT_TRUE(contains(ask({{"op", "property"}, {"stream", "a b:x"}})["error"].dump(), "a b"));
 }
 
-// Foxglove scrubs what the rings held when it connected.
+// Foxglove plays and seeks in what the rings held when it connected.
 TEST_F(View, PlaysWhatTheRingsHoldToFoxglove) {
   auto motion = session_.create<Motion>("motion", depth_of(200)).value();
   auto lidar = on_pc2_.create<std::int64_t>("lidar", depth_of(200)).value();
@@ -473,7 +483,8 @@ TEST_F(View, ByTlsServesOnlyClientsOfItsAuthority) {
   const auto revoke = [&](const std::string& name) {
     std::ofstream(own + "/revoked.crl") << pki({"revoke", name, "--ca", folder.file("truck")});
   };
-  issue("truck", "--program", "old");
+  const std::string desk = issue("truck", "--program", "desk"),
+                    old = issue("truck", "--program", "old");
   revoke("old");
   Running secure(view_argv({"--listen", "127.0.0.1:0", "--certificate", own + "/own.crt", "--key",
                             own + "/own.key", "--authority", own + "/ca.crt", "--revoked",
@@ -499,7 +510,30 @@ TEST_F(View, ByTlsServesOnlyClientsOfItsAuthority) {
   EXPECT_EQ(get(laptop), "200 TLSv1.3\n");
   EXPECT_EQ(get(""), "");
   EXPECT_EQ(get(stranger), "");
+  EXPECT_EQ(get(old), "");
   EXPECT_EQ(get(laptop), "200 TLSv1.3\n");
+  // Asks again and again by one connection, until that is ended.
+  Running staying({"/usr/bin/python3", "-c",
+                   "import http.client, ssl, sys, time\n"
+                   "address, authority, own = sys.argv[1:]\n"
+                   "context = ssl.create_default_context(cafile=authority)\n"
+                   "context.check_hostname = False\n"
+                   "context.load_cert_chain(own + '/own.crt', own + '/own.key')\n"
+                   "client = http.client.HTTPSConnection(address, context=context)\n"
+                   "client.connect()\n"
+                   "client.auto_open = False\n"
+                   "status, count = 200, 0\n"
+                   "while status == 200:\n"
+                   "  client.request('GET', '/time.js')\n"
+                   "  answer = client.getresponse()\n"
+                   "  answer.read()\n"
+                   "  status, count = answer.status, count + 1\n"
+                   "  if count == 2: print('stays', flush=True)\n"
+                   "  time.sleep(0.1)\n"
+                   "print('ended by', status, flush=True)\n",
+                   address, own + "/ca.crt", laptop},
+                  {});
+  EXPECT_EQ(staying.line(), "stays");
 
   // Files that change are used without a restart; ones that are wrong are not.
   const auto await_line = [&](const std::string& part) {
@@ -514,6 +548,8 @@ TEST_F(View, ByTlsServesOnlyClientsOfItsAuthority) {
   revoke("laptop");
   await_line("read again");
   EXPECT_EQ(get(laptop), "");
+  EXPECT_EQ(get(desk), "200 TLSv1.3\n");
+  EXPECT_EQ(staying.line(), "ended by 403");
 }
 
 // --- the command line
