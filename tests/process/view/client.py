@@ -17,6 +17,8 @@
 #                        for a sample of each channel, and prints them: "TOPIC TIME". After "play"
 #                        waits for the end, and prints how many came of each that were not before
 #                        SEEK_NS, and whether in the order of times.
+#   client.py loop URL   Subscribes to all channels of a playback and plays it, over and over. Prints
+#                        "playing" when the first sample is there.
 import asyncio
 import json
 import struct
@@ -165,5 +167,25 @@ async def play(url):
                 print("played", topic, len(set(times)), "in order" if times == sorted(times) else "wild")
 
 
+async def loop(url):
+    async with websockets.connect(url, subprotocols=[FOXGLOVE], max_size=None) as server:
+        command = struct.pack("<BBfBQI", PLAYBACK_CONTROL, 0, 10.0, 1, 0, 0)
+        is_playing = False
+        while True:
+            message = await server.recv()
+            if isinstance(message, bytes):
+                if message[0] == MESSAGE_DATA and not is_playing:
+                    is_playing = True
+                    print("playing", flush=True)
+                if message[0] == PLAYBACK_STATE and message[1] == 3:
+                    await server.send(command)
+                continue
+            message = json.loads(message)
+            if message["op"] == "advertise":
+                subscriptions = [{"id": one["id"], "channelId": one["id"]} for one in message["channels"]]
+                await server.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
+                await server.send(command)
+
+
 if __name__ == "__main__":
-    asyncio.run({"ask": ask, "send": send, "hold": hold, "play": play}[sys.argv[1]](sys.argv[2]))
+    asyncio.run({"ask": ask, "send": send, "hold": hold, "play": play, "loop": loop}[sys.argv[1]](sys.argv[2]))

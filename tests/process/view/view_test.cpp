@@ -419,6 +419,32 @@ TEST_F(View, PlaysWhatTheRingsHoldToFoxglove) {
   EXPECT_TRUE(contains(all, "played lidar@pc2 10 in order\n")) << all;
 }
 
+TEST_F(View, PlaysOnWhenAStreamIsCreatedAgainWithAnotherType) {
+  constexpr int kSamples = 2000;
+  auto motion = std::optional(session_.create<Motion>("motion", depth_of(kSamples)).value());
+  auto number = session_.create<std::int64_t>("number", depth_of(kSamples)).value();
+  for (int i = 0; i < kSamples; ++i) {
+    motion->write({1.0 * i, {}, i}, at_ns(1000 * kSecond + i * 1'000'000));
+    number.write(i, at_ns(1000 * kSecond + i * 1'000'000));
+  }
+  await([&] { return ask({{"op", "overview"}})["streams"].size() == 2; });
+  Running client({"/usr/bin/python3", source("tests/process/view/client.py"), "loop",
+                  websocket_url() + "hold"},
+                 {});
+  ASSERT_EQ(client.line(), "playing") << client.rest();
+  ASSERT_TRUE(session_.remove(motion->id()));
+  motion.reset();
+  auto other = session_.create<double>("motion", depth_of(8)).value();
+  other.write(1);
+  await([&] {
+    const Json answer = ask({{"op", "at"}, {"streams", {"motion:0@pc1", "number:0@pc1"}}});
+    return answer.contains("samples") && answer["samples"][0]["payload_bytes"] == 8 &&
+           answer["samples"][1]["tid"] == kSamples - 1;
+  });
+  view_.signal(SIGTERM);
+  EXPECT_EQ(view_.status(), 0);
+}
+
 // --- clients that do not read
 
 TEST_F(View, DelaysNobodyForABrowserThatStands) {

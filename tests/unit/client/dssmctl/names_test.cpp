@@ -62,6 +62,16 @@ TEST(StreamFilter, TakesStreamsOfTheGivenHostsOnly) {
   EXPECT_TRUE(StreamFilter({}, {}).takes({"odom", 0, "pc2"}));
 }
 
+TEST(PatternOf, FitsThatStreamOnly) {
+  const StreamId stars{"c*[a]?\\", 3, "pc2"};
+  const StreamFilter filter({}, {pattern_of(stars.str())});
+  EXPECT_TRUE(filter.takes(stars));
+  EXPECT_FALSE(filter.takes({"c*a?\\", 3, "pc2"}));
+  EXPECT_FALSE(filter.takes({"cam[a]?\\", 3, "pc2"}));
+  EXPECT_FALSE(filter.takes({stars.name, 4, "pc2"}));
+  EXPECT_FALSE(filter.takes({stars.name, 3, "pc1"}));
+}
+
 TEST(Duplicates, AreStreamsOfOneNameAndIdOnSeveralHosts) {
   std::vector<StreamInfo> streams;
   for (const StreamId& id : std::vector<StreamId>{
