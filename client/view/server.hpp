@@ -116,9 +116,9 @@ class Server {
                   std::function<void(Answer)> make);
 
   // GET of `path`/FILE is answered by the folder's file, if its name ends with `suffix`.
-  void serve_folder(const std::string& path, std::filesystem::path folder, std::string suffix,
-                    std::string content_type) {
-    folders_.push_back({path, std::move(folder), std::move(suffix), std::move(content_type)});
+  void serve_folder(const std::string& path, const std::filesystem::path& folder,
+                    std::string suffix, std::string content_type) {
+    folders_.push_back({path, folder.string(), std::move(suffix), std::move(content_type)});
   }
 
   // Calls `call` in the thread of run(), each `period`.
