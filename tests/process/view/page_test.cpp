@@ -192,8 +192,9 @@ TEST_F(ViewPage, ShowsTheDriveOfTheExample) {
   if (!std::filesystem::exists(built(programs + "lidar"))) {
     GTEST_SKIP() << "the example is not built";
   }
+  // The encoder's debug information is there until it ends, 2.5 s after that.
   const std::string start_at =
-      std::to_string(to_ns(WallClock::now() + std::chrono::seconds(1)) / kSecond);
+      std::to_string(to_ns(WallClock::now() + std::chrono::seconds(6)) / kSecond);
   const auto replay = [&](const std::string& program, const DaemonProcess& dssmd) {
     return Running(
         {built(programs + program), "--log", source(programs + "data/freiburg-079.carmen.log.gz"),
