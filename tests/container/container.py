@@ -22,7 +22,7 @@ sys.path.insert(0, str(HERE.parent / "packages"))
 from tree import Unavailable, mount_overlay  # noqa: E402
 
 # Installed at the start: the bare PC of a vehicle.
-PACKAGES = "systemd,dbus,python3,sudo,nftables"
+PACKAGES = "systemd,dbus,python3,sudo,nftables,procps"
 # Packages that the role and the packages may install.
 CACHED = "avahi-daemon chrony prometheus python3-apt"
 TIMEOUT_S = 60.0  # for actions that take about a second
