@@ -374,8 +374,11 @@ def recording(page, stream, oldest_ns, newest_ns):
     page.open("signals", signals={"span": 10, "panels": [[[stream, "x_m"]]]})
     page.wait("the first sample", lambda: page.get("#time", "data-t-ns") == oldest_ns)
     assert not page.one("#live").is_displayed()
-    page.run("const rate = document.querySelector('#rate');"
-             "rate.value = '10'; rate.dispatchEvent(new Event('change'))")
+    def play_at(rate):
+        page.run("const rate = document.querySelector('#rate');"
+                 "rate.value = arguments[0]; rate.dispatchEvent(new Event('change'))", rate)
+
+    play_at("1")  # so slow that it does not end before it is held
     page.press("r")
     page.wait("it plays", lambda: page.get("#time", "data-mode") == "play")
     page.wait("it goes on", lambda: int(page.get("#time", "data-t-ns")) > int(oldest_ns) + 10**9)
@@ -384,6 +387,7 @@ def recording(page, stream, oldest_ns, newest_ns):
                      and page.get("#time", "data-t-ns"))
     assert int(oldest_ns) < int(held) < int(newest_ns), held
     page.shot("recording-signals")
+    play_at("50")
     page.press(" ")
     page.wait("its end", lambda: page.get("#time", "data-mode") == "hold"
               and page.get("#time", "data-t-ns") == newest_ns)
