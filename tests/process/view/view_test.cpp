@@ -437,7 +437,7 @@ TEST_F(View, PlaysOnWhenAStreamIsCreatedAgainWithAnotherType) {
   auto other = session_.create<double>("motion", depth_of(8)).value();
   other.write(1);
   await([&] {
-    const Json answer = ask({{"op", "at"}, {"streams", {"motion:0@pc1", "number:0@pc1"}}});
+    Json answer = ask({{"op", "at"}, {"streams", {"motion:0@pc1", "number:0@pc1"}}});
     return answer.contains("samples") && answer["samples"][0]["payload_bytes"] == 8 &&
            answer["samples"][1]["tid"] == kSamples - 1;
   });
