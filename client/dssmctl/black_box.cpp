@@ -115,7 +115,7 @@ class BlackBox {
     announce();
   }
 
-  // Created only now: a stream more would be in the way of those who never have an incident.
+  // Creates the stream only now: who never has an incident needs none.
   void announce() {
     const RecordingProgress progress = recorder_.progress();
     RecordedIncident incident{};
@@ -130,7 +130,7 @@ class BlackBox {
     if (writer) {
       writer->write(incident);
     } else {
-      notice(fmt::format("other programs do not get to know of the incident: {}",
+      notice(fmt::format("the incident is not announced in '{}': {}", kIncidentStream,
                          escaped_message(writer.error().message)));
     }
   }

@@ -182,10 +182,6 @@ void add_streams(std::string& text, const std::vector<StreamInfo>& streams) {
                        const std::function<Number(const StreamInfo&)>& value) {
     add_each<StreamInfo>(text, streams, name, type, help, stream_labels, value);
   };
-  const auto has_age = [](const StreamInfo& stream) {
-    return stream.state == StreamState::live || stream.state == StreamState::stalled ||
-           stream.state == StreamState::no_writer;
-  };
   add("dssm_stream_samples", "counter", "Samples written since the stream was created.",
       [](const StreamInfo& stream) { return static_cast<double>(stream.newest + 1); });
   add("dssm_stream_sample_bytes", "gauge", "Payload of a sample, at most.",
@@ -198,7 +194,7 @@ void add_streams(std::string& text, const std::vector<StreamInfo>& streams) {
       });
   add("dssm_stream_age_seconds", "gauge", "How old the newest sample is.",
       [&](const StreamInfo& stream) {
-        return has_age(stream) ? Number(seconds(stream.age)) : Number();
+        return is_age_known(stream) ? Number(seconds(stream.age)) : Number();
       });
   add("dssm_stream_last_sample_timestamp_seconds", "gauge",
       "The time of the newest sample, since 1970.", [](const StreamInfo& stream) {
@@ -208,7 +204,7 @@ void add_streams(std::string& text, const std::vector<StreamInfo>& streams) {
       });
   add("dssm_stream_stalled", "gauge", "1: no sample came for longer than the stream ever pauses.",
       [&](const StreamInfo& stream) {
-        return has_age(stream) ? Number(stream.state == StreamState::live ? 0 : 1) : Number();
+        return is_age_known(stream) ? Number(is_silent(stream) ? 1 : 0) : Number();
       });
   add("dssm_stream_readers", "gauge",
       "How many times the stream is open for reading, on all hosts.",

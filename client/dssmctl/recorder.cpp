@@ -21,6 +21,15 @@ std::optional<Time> time_from_tid(const RawReader& reader, Tid tid) {
   return std::nullopt;
 }
 
+// Puts the cursor before the sample of that time, unless it is beyond. To read over the samples
+// before it would copy each.
+void skip_to(RawReader& reader, Time time) {
+  SampleInfo info;
+  if (reader.find(time, info) == ReadStatus::ok && info.tid - 1 > reader.cursor()) {
+    reader.seek(info.tid - 1);
+  }
+}
+
 Time after(Time time) { return saturating_add(time, Duration(1)); }
 
 }  // namespace
@@ -251,12 +260,8 @@ Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
     if (plan_.range) {
       source.from = plan_.range->first;
       source.until = plan_.range->last;
-      // To skip samples costs a copy of each.
-      SampleInfo info;
-      if (source.reader.find(*source.from, info) == ReadStatus::ok) {
-        source.reader.seek(info.tid - 1);
-      }
     }
+    if (source.from) skip_to(source.reader, *source.from);
   }
   return source;
 }
@@ -316,11 +321,7 @@ void Recorder::want_past(Source& source) const {
   RawReader& reader = source.reader;
   source.from = past_of(source, wanted_from_, before_);
   source.next = kNoTid;
-  SampleInfo info;
-  // To skip samples costs a copy of each.
-  if (reader.find(*source.from, info) == ReadStatus::ok && info.tid - 1 > reader.cursor()) {
-    reader.seek(info.tid - 1);
-  }
+  skip_to(reader, *source.from);
   const Tid newest = reader.newest_tid();
   source.past_until = newest > reader.cursor() ? newest : kNoTid;
 }

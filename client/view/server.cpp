@@ -187,7 +187,7 @@ class Server::Credentials {
     ++generation_;
     return {};
   }
-  // Also after a failure: permissions are no property of the files' contents.
+  // Also after a failure, whose reason may pass without a change of the files.
   bool is_to_load() const { return !is_loaded_ || stamps() != stamps_; }
 
   // A connection whose handshake was with earlier files may not go on.

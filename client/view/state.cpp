@@ -49,7 +49,7 @@ Json streams_json(const std::vector<StreamInfo>& streams, std::optional<TimeRang
     json["newest_ns"] = oldest ? time_json(stream.newest_time) : Json();
     json["mirror"] = stream.mirror ? ctl::mirror_json(*stream.mirror) : Json();
     list.push_back(std::move(json));
-    // Incidents stay in their ring for ever.
+    // Samples of a black box may be hours older than all others.
     if (oldest && !ctl::is_of_black_box(stream.id)) extend(range, *oldest, stream.newest_time);
   }
   return list;
@@ -279,7 +279,7 @@ void StateCollector::find_events(const std::vector<HostInfo>& hosts) {
   streams_ = std::move(new_streams);
 }
 
-// Those from when dssm-view was started on.
+// Only those since dssm-view was started.
 void StateCollector::find_incidents(const StreamInfo& stream) {
   const std::string name = stream.id.str();
   auto reader = incidents_.find(name);

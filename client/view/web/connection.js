@@ -59,7 +59,8 @@ export class Connection extends EventTarget {
     // The server ends a connection with too many unanswered requests.
     if (this.waiting.size >= kMaxUnderWay) {
       return new Promise((resolve, reject) => {
-        this.queue.push({ request: () => this.request(op, parameters, answerMs).then(resolve, reject), reject });
+        const request = () => this.request(op, parameters, answerMs).then(resolve, reject);
+        this.queue.push({ request, reject });
       });
     }
     const id = this.nextId;

@@ -78,7 +78,8 @@ export class SaveDialog {
     const name = path.slice(path.lastIndexOf("/") + 1);
     const link = element("a", { href: path, download: name }, name);
     const text =
-      `: ${counted(samples, "sample")} of ${counted(streams, "stream")}, ${bytes(size)}` + (lost > 0 ? `; ${lost} lost` : "");
+      `: ${counted(samples, "sample")} of ${counted(streams, "stream")}, ${bytes(size)}` +
+      (lost > 0 ? `; ${lost} lost` : "");
     this.result.replaceChildren(
       element("p", {}, link, text),
       ...notices.map((notice) => element("p", { class: "notice" }, notice)),

@@ -392,8 +392,9 @@ class Card {
 
   async askProperty() {
     const { time, connection } = this.views;
-    const isNew = time.t !== this.propertyT || performance.now() - this.propertyAt > kPropertyPeriodMs;
-    if (this.shownKind() !== "property" || !this.drawing || !isNew) return;
+    const isOld = performance.now() - this.propertyAt > kPropertyPeriodMs;
+    const isDue = time.t !== this.propertyT || isOld;
+    if (this.shownKind() !== "property" || !this.drawing || !isDue) return;
     this.propertyAt = performance.now();
     this.propertyT = time.t;
     const { drawing } = this;

@@ -111,6 +111,9 @@ TEST_F(BlackBox, KeepsWhatWasBeforeAndAfterARequest) {
   EXPECT_STREQ(incident.reason, "a person said so");
   EXPECT_EQ(incident.file, file);
   EXPECT_EQ(incident.samples, 201U);
+  // Its stream has no writer now, as it should be.
+  EXPECT_TRUE(contains(output({"metrics"}),
+                       "dssm_stream_stalled{stream=\"dssm_incident\",id=\"0\",host=\"pc1\"} 0\n"));
 
   const Recording recording = Recording::open(file).value();
   auto reader = recording.open_reader<Power>("power").value();
