@@ -26,13 +26,21 @@ def first_lines(text: str | None) -> str:
     return "\n".join((text or "").strip().splitlines()[:MAX_LINES])
 
 
-def final_failure(case: ElementTree.Element) -> str:
-    """Beginning and end of the output of a program that failed without naming a failed test."""
-    printed = case.findtext("system-err") or case.findtext("system-out") or ""
+def beginning_and_end(printed: str) -> str:
+    """Of the output of a program that failed without naming a failed test."""
     lines = printed.strip().splitlines()
     if len(lines) > 2 * MAX_LINES:
         lines[MAX_LINES:-MAX_LINES] = ["..."]
     return "\n".join(lines)
+
+
+def unfinished(program: dict) -> str:
+    """What GoogleTest's program printed in a test that did not end; empty if each did."""
+    printed = program.get("stdout", "")
+    test = printed[max(printed.rfind("[ RUN "), 0) :]
+    if not test or "[       OK ]" in test or "[  FAILED  ]" in test:
+        return ""
+    return beginning_and_end(test + "\n".join(program.get("stderr", "").splitlines()[-MAX_LINES:]))
 
 
 def count(folder: pathlib.Path) -> tuple[int, int, int]:
@@ -45,7 +53,10 @@ def count(folder: pathlib.Path) -> tuple[int, int, int]:
             failed += 1
             print(f"FAILED  {name}")
             for failure in failures:
-                text = first_lines(failure.get("message") or failure.text) or final_failure(case)
+                text = first_lines(failure.get("message") or failure.text)
+                text = text or beginning_and_end(
+                    case.findtext("system-err") or case.findtext("system-out") or ""
+                )
                 if text:
                     print(textwrap.indent(text, " " * 8))
         elif case.find("skipped") is not None or case.get("result") in ("skipped", "suppressed"):
@@ -57,6 +68,8 @@ def count(folder: pathlib.Path) -> tuple[int, int, int]:
     bad = [p for p in programs if p["result"] not in ("OK", "EXPECTEDFAIL", "SKIP")]
     for program in bad:
         print(f"FAILED  {folder.parent.name}: {program['name']} ({program['result']})")
+        if text := unfinished(program):
+            print(textwrap.indent(text, " " * 8))
     return passed, max(failed, len(bad)), skipped
 
 
