@@ -195,7 +195,7 @@ class FoxgloveConnection : public Connection {
       }
       peer_.send(Message::binary({message}));
     }
-    if (left_out_ > 0 && now >= next_report_) {
+    if (left_out_ > 0 && now >= next_report_ && peer_.waiting_bytes() < kMaxWaitingBytes) {
       next_report_ = now + kLossReportPeriod;
       report(1,
              fmt::format("{} samples were left out: {}", std::exchange(left_out_, 0),

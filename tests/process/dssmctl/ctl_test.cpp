@@ -50,9 +50,13 @@ bool Running::take_line(std::string& line) {
   return true;
 }
 
+void Running::signal_again() {
+  if (MonoClock::now() >= signal_again_) signal(ending_ == SIGINT ? SIGTERM : SIGINT);
+}
+
 void Running::read_some(int timeout_ms) {
   if (kLosesSignals && ending_ != 0) {
-    if (MonoClock::now() >= signal_again_) signal(ending_ == SIGINT ? SIGTERM : SIGINT);
+    signal_again();
     if (timeout_ms < 0) timeout_ms = kSignalAgainMs;
   }
   pollfd fd{fd_, POLLIN, 0};
@@ -104,7 +108,16 @@ void Running::stop() {
   ASSERT_TRUE(WIFSTOPPED(status));
 }
 
-int Running::status() { return wait_for(std::exchange(pid_, -1)); }
+int Running::status() {
+  siginfo_t end{};
+  while (kLosesSignals && ending_ != 0 &&
+         ::waitid(P_PID, static_cast<id_t>(pid_), &end, WEXITED | WNOHANG | WNOWAIT) == 0 &&
+         end.si_pid == 0) {
+    signal_again();
+    std::this_thread::sleep_for(kPollPause);
+  }
+  return wait_for(std::exchange(pid_, -1));
+}
 
 std::vector<std::string> CtlTest::argv(std::vector<std::string> words) const {
   words.insert(words.begin(), dssmctl_path());

@@ -64,6 +64,7 @@ class Running {
  private:
   bool take_line(std::string& line);
   void read_some(int timeout_ms);  // -1: waits for ever
+  void signal_again();             // if the one that was to end it seems lost
   pid_t pid_ = -1;
   int fd_ = -1;
   bool ended_ = false;
