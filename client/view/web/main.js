@@ -24,6 +24,7 @@ const find = (id) => document.getElementById(id);
 const scheme = location.protocol === "https:" ? "wss" : "ws";
 const connection = new Connection(`${scheme}://${location.host}/`);
 const time = new Time();
+const kFirstView = "first view"; // a mark for measurements: hosts are shown
 let overview = null; // the last answer
 
 // --- types of streams ----------------------------------------------------------------------------
@@ -151,6 +152,9 @@ const overviewPump = new Pump(connection, kOverviewMs, async () => {
   find("host").title = `dssm-view ${overview.version}`;
   document.title = `${overview.host} \u2013 DSSM view`;
   overviewPage.show(overview);
+  if (overview.hosts.length > 0 && performance.getEntriesByName(kFirstView).length === 0) {
+    performance.mark(kFirstView);
+  }
   views.showStreams();
   if (page() && (first || !page().suggested)) page().open();
   showBanner();

@@ -141,8 +141,11 @@ def overview(page, program, *streams):
     assert page.all("#graph path.edge"), "the graph has no arrow"
     assert page.one("#findings-group").text.count("\n") > 0, "no findings of doctor"
     page.shot("overview-light")
-    paint = "return performance.getEntriesByName('first-contentful-paint')[0]?.startTime"
-    say("first paint after", page.run(paint), "ms")
+    for what in ["first-contentful-paint", "first view"]:
+        times = page.run("return performance.getEntriesByName(arguments[0])", what)
+        say(what, *(f"{entry['startTime']:.0f} ms after the request" for entry in times))
+    loaded = page.run("return performance.getEntriesByType('navigation')[0].responseEnd")
+    say(f"the page's text {loaded:.0f} ms after it")
     page.show_as(DESKTOP, "dark")
     page.wait("dark", lambda: page.run("return document.documentElement.dataset.theme") == "dark")
     page.shot("overview-dark")

