@@ -566,6 +566,22 @@ TEST_F(View, ByTlsServesOnlyClientsOfItsAuthority) {
                    address, own + "/ca.crt", laptop},
                   {});
   EXPECT_EQ(staying.line(), "stays");
+  Running page({"/usr/bin/python3", "-c",
+                "import asyncio, ssl, sys, websockets\n"
+                "address, authority, own = sys.argv[1:]\n"
+                "context = ssl.create_default_context(cafile=authority)\n"
+                "context.check_hostname = False\n"
+                "context.load_cert_chain(own + '/own.crt', own + '/own.key')\n"
+                "async def main():\n"
+                "  async with websockets.connect('wss://' + address, ssl=context,\n"
+                "      subprotocols=['dssm.view.v1']) as server:\n"
+                "    print('open', flush=True)\n"
+                "    await server.wait_closed()\n"
+                "    print('closed,', server.close_reason, flush=True)\n"
+                "asyncio.run(main())\n",
+                address, own + "/ca.crt", laptop},
+               {});
+  EXPECT_EQ(page.line(), "open");
 
   // Files that change are used without a restart; ones that are wrong are not.
   const auto await_line = [&](const std::string& part) {
@@ -582,6 +598,7 @@ TEST_F(View, ByTlsServesOnlyClientsOfItsAuthority) {
   EXPECT_EQ(get(laptop), "");
   EXPECT_EQ(get(desk), "200 TLSv1.3\n");
   EXPECT_EQ(staying.line(), "ended by 403");
+  EXPECT_EQ(page.line(), "closed, the certificates were read again");
 }
 
 // --- the command line
