@@ -87,8 +87,10 @@ void sleep_for(Duration time) noexcept {  // no cancellation point
   ::syscall(SYS_clock_nanosleep, CLOCK_MONOTONIC, 0, &pause, nullptr);
 }
 
-// Takes the word for thread `id`; until then sleeps, at most until `deadline`.
-LockResult take_word(std::atomic<std::uint32_t>& word, std::uint32_t id, MonoTime deadline,
+// Takes the word for thread `id`; until then sleeps, at most for `patience`, from which it takes
+// that time. A sleep counts no longer than it was to be: when the whole PC stood still meanwhile,
+// the holder did so, too.
+LockResult take_word(std::atomic<std::uint32_t>& word, std::uint32_t id, Duration& patience,
                      Pending& pending) noexcept {
   std::uint32_t waiters = 0;  // once this thread has slept: others may sleep still
   std::uint32_t found = word.load(std::memory_order_relaxed);
@@ -100,19 +102,21 @@ LockResult take_word(std::atomic<std::uint32_t>& word, std::uint32_t id, MonoTim
       }
       continue;
     }
-    const MonoTime now = MonoClock::now();
-    if (now >= deadline) return LockResult::busy;
+    if (patience <= Duration::zero()) return LockResult::busy;
     if (!(found & FUTEX_WAITERS) &&
         !word.compare_exchange_weak(found, found | FUTEX_WAITERS, std::memory_order_relaxed)) {
       continue;
     }
-    const timespec until = timespec_of(std::min(deadline, now + kMaxSleepOnWord));
+    const MonoTime begin = MonoClock::now();
+    const Duration sleep = std::min(patience, kMaxSleepOnWord);
+    const timespec until = timespec_of(begin + sleep);
     // The holder may be a thread of another container with the same id: if this one ends while it
     // sleeps, the kernel must not take it for the holder.
     pending.pause();
     ::syscall(SYS_futex, &word, FUTEX_WAIT_BITSET, found | FUTEX_WAITERS, &until, nullptr,
               FUTEX_BITSET_MATCH_ANY);
     pending.resume();
+    patience -= std::min(MonoClock::now() - begin, sleep);
     waiters = FUTEX_WAITERS;
     found = word.load(std::memory_order_relaxed);
   }
@@ -198,14 +202,14 @@ RobustLock::Private& RobustLock::own() const noexcept {
   const bool has_word = word().compare_exchange_strong(found, self.id, std::memory_order_acquire);
   if (!has_word || !own.claim(self.id)) {
     if (has_word) give_back(word(), 0);
-    const Duration patience = own.was_in_vain ? kMaxWaitAgain : kMaxWait;
-    const MonoTime deadline = may_wait ? deadline_in(patience) : MonoTime::min();
-    while ((result = take_word(word(), self.id, deadline, pending)) != LockResult::busy &&
+    Duration patience = !may_wait ? Duration::zero() : own.was_in_vain ? kMaxWaitAgain : kMaxWait;
+    while ((result = take_word(word(), self.id, patience, pending)) != LockResult::busy &&
            !own.claim(self.id)) {
       // The other thread is about to end, or another process has changed the word.
       give_back(word(), result == LockResult::recovered ? FUTEX_OWNER_DIED : 0);
       result = LockResult::busy;
-      if (MonoClock::now() >= deadline) break;
+      if (patience <= Duration::zero()) break;
+      patience -= kClaimPause;
       sleep_for(kClaimPause);
     }
     if (result == LockResult::busy) {

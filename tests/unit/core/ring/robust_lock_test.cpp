@@ -91,6 +91,40 @@ TEST(RobustLock, NoticesThatItsHolderEnded) {
   file.lock.unlock();
 }
 
+// As a virtual machine that gets no processor for a while.
+TEST(RobustLock, CountsNoTimeInWhichTheProcessStandsStill) {
+#ifdef __SANITIZE_THREAD__
+  GTEST_SKIP() << "ThreadSanitizer does not know threads of a forked process";
+#endif
+  const LockFile file;
+  int waits[2], go[2];
+  ASSERT_EQ(::pipe(waits), 0);
+  ASSERT_EQ(::pipe(go), 0);
+  char byte = 0;
+  const pid_t child = ::fork();
+  if (child == 0) {
+    if (file.lock.lock() != LockResult::locked) ::_exit(2);
+    LockResult result = LockResult::busy;
+    std::thread waiter([&] { result = file.lock.lock(); });
+    while (!(file.word() & FUTEX_WAITERS)) std::this_thread::yield();
+    if (::write(waits[1], &byte, 1) != 1 || ::read(go[0], &byte, 1) != 1) ::_exit(3);
+    file.lock.unlock();
+    waiter.join();
+    ::_exit(result == LockResult::locked ? 0 : 1);
+  }
+  ASSERT_EQ(::read(waits[0], &byte, 1), 1);
+  ASSERT_EQ(::kill(child, SIGSTOP), 0);
+  std::this_thread::sleep_for(RobustLock::kMaxWait + std::chrono::milliseconds(100));
+  ASSERT_EQ(::kill(child, SIGCONT), 0);
+  // What it would give up in.
+  std::this_thread::sleep_for(std::chrono::milliseconds(100));
+  ASSERT_EQ(::write(go[1], &byte, 1), 1);
+  int status = 0;
+  ASSERT_EQ(::waitpid(child, &status, 0), child);
+  EXPECT_EQ(status, 0);
+  for (const int fd : {waits[0], waits[1], go[0], go[1]}) ::close(fd);
+}
+
 TEST(RobustLock, WakesAThreadThatWaits) {
   const LockFile file;
   constexpr int kTimes = 50;
