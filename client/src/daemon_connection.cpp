@@ -59,7 +59,13 @@ Result<std::optional<local::Response>> next_message(LocalInput& input) {
 Result<NewConnection> NewConnection::greet(const SessionOptions& options, std::uint64_t number) {
   UniqueFd socket = DSSM_TRY(wire::connect_unix(options.socket_path));
   ::setsockopt(socket.get(), SOL_SOCKET, SO_SNDTIMEO, &kSocketTimeout, sizeof kSocketTimeout);
-  ::setsockopt(socket.get(), SOL_SOCKET, SO_RCVTIMEO, &kSocketTimeout, sizeof kSocketTimeout);
+  timeval patience = kSocketTimeout;
+  // The program waits for the first connection itself, as for a request.
+  if (number == 1) {
+    const auto wanted = std::chrono::ceil<std::chrono::seconds>(options.request_timeout).count();
+    patience.tv_sec = std::max<time_t>(patience.tv_sec, wanted);
+  }
+  ::setsockopt(socket.get(), SOL_SOCKET, SO_RCVTIMEO, &patience, sizeof patience);
   NewConnection connection(std::move(socket), number);
   local::Request hello;
   hello.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);
@@ -209,6 +215,12 @@ Result<bool> DaemonConnection::deliver(local::Response& response) {
   if (in_flight.waiter) {
     in_flight.waiter->answer = Answer{std::move(response), std::move(fds), number_};
     changed_.notify_all();
+  } else if (response.has_opened()) {
+    // Too late: nobody would close what dssmd has opened.
+    local::Request close;
+    close.set_serial(next_serial_++);
+    close.mutable_close()->set_handle(response.opened().handle());
+    DSSM_TRY(send_locked(close, {}));
   }
   return true;
 }

@@ -172,12 +172,9 @@ void OpenStreams::offer(NewConnection& connection, std::uint64_t key) {
     const auto entry = streams_.find(key);
     const bool is_open = entry != streams_.end();
     if (!opened) {
-      // Refused: its users keep this ring; readers continue with the ring that has its name now, or
-      // get to know that they may not.
-      const Errc code = opened.error().code;
-      if (is_open && (code == Errc::conflict || code == Errc::no_permission)) {
-        entry->second->supersede();
-      }
+      // Refused: its users keep this ring, which gets nothing more if it is a mirror. Readers
+      // continue with the ring that has its name now, as soon as there is one that they may have.
+      if (is_open && opened.error().code != Errc::unavailable) entry->second->supersede();
     } else if (opened->has_opened()) {
       (is_open ? entry->second->handle_ : unused_handle) = opened->opened().handle();
     }

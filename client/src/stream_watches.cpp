@@ -29,8 +29,9 @@ Result<std::uint64_t> StreamWatches::add(OnEvent on_event) {
   if (!is_first) return key;
   if (auto done = connection_.call(watch_request()); !done) {
     const std::lock_guard guard(mutex_);
-    watching_ = false;
     watches_.erase(key);
+    // Those that were added meanwhile count on this request: on_connected() repeats it for them.
+    watching_ = !watches_.empty();
     return std::move(done).error();
   }
   return key;

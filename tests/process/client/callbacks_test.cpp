@@ -63,7 +63,10 @@ TEST_F(Callbacks, GetEachSampleInOrderInOneThreadWithoutSignals) {
                      session.subscribe<Numbered>("b", [&](const Sample<Numbered>&) {
                        threads.add(std::this_thread::get_id());
                      })};
-  for (const auto& one : both) ASSERT_TRUE(one);
+  for (const auto& one : both) {
+    ASSERT_TRUE(one);
+    await([&] { return one->is_open(); });
+  }
   write(writer, 0, 99);
   write(second, 0, 99);
   EXPECT_EQ(calls.await(100), tids(0, 99));
@@ -343,6 +346,7 @@ TEST_F(Callbacks, OutliveTheirSession) {
   auto subscribed = [&] {
     return test::connect(daemon).subscribe<Numbered>("a", note(calls)).value();
   }();
+  await([&] { return subscribed.is_open(); });
   write(writer, 0, 5);
   calls.await(6);
   subscribed = session.subscribe<Numbered>("a", note(calls)).value();

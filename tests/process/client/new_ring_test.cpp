@@ -6,6 +6,7 @@
 
 #include <atomic>
 #include <dssm/dssm.hpp>
+#include <future>
 #include <memory>
 #include <thread>
 
@@ -207,6 +208,31 @@ TEST(NewRing, KeepsAPollableDescriptorReadableUntilItIsOpened) {
     if (!again && relay.opens() == 2) again = recreate(writing);  // it has tried in vain
   }
   EXPECT_EQ(reader.restarts(), 1u);
+}
+
+// Nobody has it then, and the reader must not stay in the list for ever.
+TEST(LateAnswer, LeavesNoOpenStream) {
+  const DaemonProcess daemon;
+  Session writing = connect(daemon);
+  const Writer<double> writer = writing.create<double>("late", History{16, 1ms}).value();
+  const auto readers = [&] { return writing.stream_info({"late", 0, ""}).value().readers; };
+  test::Relay relay(daemon.socket_path());
+  std::optional<Session> impatient;
+  await([&] {  // a busy dssmd may be late with its greeting
+    auto connected =
+        Session::connect({.socket_path = relay.socket_path(), .request_timeout = 200ms});
+    if (connected) impatient = std::move(*connected);
+    return impatient.has_value();
+  });
+  std::promise<void> release;
+  relay.set_behind([answer = release.get_future().share()](const local::Response& response) {
+    if (response.has_opened()) answer.wait();
+    return std::string();
+  });
+  EXPECT_FALSE(impatient->open_reader<double>("late"));
+  await([&] { return readers() == 1; });
+  release.set_value();
+  await([&] { return readers() == 0; });
 }
 
 // After an attempt that found that there is no new ring, nothing is to be signalled.

@@ -9,11 +9,14 @@
 #include <atomic>
 #include <csignal>
 #include <dssm/dssm.hpp>
+#include <fstream>
+#include <future>
 #include <optional>
 #include <thread>
 
 #include "tests/support/await.hpp"
 #include "tests/support/daemon_process.hpp"
+#include "tests/support/folder.hpp"
 #include "tests/support/samples.hpp"
 #include "tests/support/session.hpp"
 
@@ -143,6 +146,65 @@ TEST(Restart, NotifiesWatchersOfRemovedStreams) {
   lock.lock();
   changed.wait(lock, [&] { return seen.back() == "+marker"; });
   EXPECT_EQ(seen, (std::vector<std::string>{"+kept", "+gone", "-gone", "+marker"}));
+}
+
+// Two watches that are made at once share a request: when that fails, the one that was made first
+// fails, and the other one counts on the next dssmd.
+TEST(Restart, NotifiesAWatchThatWasMadeWhileAnotherOneWaited) {
+  DaemonProcess daemon;
+  Session other = connect(daemon);
+  std::optional<Session> impatient;
+  await([&] {
+    auto connected =
+        Session::connect({.socket_path = daemon.socket_path(), .request_timeout = 200ms});
+    if (connected) impatient = std::move(*connected);
+    return impatient.has_value();
+  });
+  daemon.kill_hard();
+  std::atomic<bool> heard{false};
+  const auto watch = [&] {
+    return impatient->watch([&](const StreamEvent& event) {
+      if (event.stream.id.name == "marker") heard = true;
+    });
+  };
+  std::optional<Session::Watch> watching;
+  await([&] {
+    auto another = std::async(std::launch::async, watch);
+    auto one = watch(), two = another.get();
+    if (one.has_value() == two.has_value()) return false;  // one after the other
+    watching = one ? *std::move(one) : *std::move(two);
+    return true;
+  });
+  daemon.start();
+  const auto marker = other.create<Numbered>("marker", History{16, 1ms}).value();
+  await([&] { return heard.load(); });
+}
+
+// As after a change of the configuration.
+TEST(Restart, ReadersGoOnThatTheNextDaemonHasNoPlaceForAtFirst) {
+  const test::TestFolder folder;
+  const auto configure = [&](const char* text) {
+    std::ofstream(folder.file("dssmd.conf")) << text << '\n';
+  };
+  configure("");
+  DaemonProcess daemon({"--config", folder.file("dssmd.conf")});
+  Session session = connect(daemon);
+  Writer<Numbered> writer = session.create<Numbered>("s", History{16, 1ms}).value();
+  Reader<Numbered> reader = session.open_reader<Numbered>("s").value();
+  daemon.kill_hard();
+  configure("max_opens = 1");  // it is the writer's, which is offered first
+  daemon.start();
+  const auto users = [&] {
+    const auto info = session.stream_info({"s", 0, ""});
+    return info ? std::pair(info->writers, info->readers) : std::pair(0U, 0U);
+  };
+  await([&] { return users() == std::pair(1U, 0U); });
+  configure("max_opens = 8");
+  ASSERT_EQ(::kill(daemon.pid(), SIGHUP), 0);
+  await([&] {
+    static_cast<void>(reader.read_next());
+    return users() == std::pair(1U, 1U);
+  });
 }
 
 TEST(Restart, FailsRequestsWithAReasonWhileTheDaemonIsDown) {
