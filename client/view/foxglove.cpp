@@ -353,6 +353,12 @@ class FoxgloveConnection : public Connection {
     return reader.incarnation() == channel.incarnation ? &reader : nullptr;
   }
 
+  void leave_out_before(Subscription& subscription, Tid tid) {
+    if (tid <= subscription.next) return;
+    left_out_ += static_cast<std::uint64_t>(tid - subscription.next);
+    subscription.next = tid;
+  }
+
   // Of each subscription the samples after the last one sent, until `until`, or until there are
   // many; then `until` is before the others.
   std::vector<Due> due_of_rings(Time& until) {
@@ -369,17 +375,19 @@ class FoxgloveConnection : public Connection {
         const ReadStatus found = reader->find(playback_->position, info);
         // Else it is still on its way, or may not be read by time.
         if (found != ReadStatus::ok && found != ReadStatus::too_old) continue;
-        subscription.next = found == ReadStatus::ok ? info.tid + 1 : 0;
+        subscription.next = found == ReadStatus::ok ? info.tid + 1 : reader->oldest_tid();
       }
-      // What is older was overwritten meanwhile.
-      subscription.next = std::max(subscription.next, reader->oldest_tid());
+      leave_out_before(subscription, reader->oldest_tid());  // it was overwritten meanwhile
       const Tid end = reader->newest_tid() + 1;
       std::size_t taken = 0;
       for (Tid tid = subscription.next; tid < end && taken < share; ++tid) {
         const ReadStatus status = reader->read_info(tid, info);
         if (status == ReadStatus::arriving || (status == ReadStatus::ok && info.time > until))
           break;
-        if (status != ReadStatus::ok) continue;  // it was lost
+        if (status != ReadStatus::ok) {  // it was lost
+          if (taken == 0) leave_out_before(subscription, tid + 1);
+          continue;
+        }
         due.push_back({info.time, id, tid});
         if (++taken == share) until = info.time;
       }
@@ -406,7 +414,11 @@ class FoxgloveConnection : public Connection {
       }
       Message message =
           sample_message(due.subscription, channel.type, sample.info(), sample.payload());
-      if (sample.still_valid()) peer_.send(std::move(message));
+      if (sample.still_valid()) {
+        peer_.send(std::move(message));
+      } else {
+        ++left_out_;
+      }
     }
     return until;
   }
@@ -500,15 +512,10 @@ class FoxgloveConnection : public Connection {
     const Tid newest = reader.newest_tid();
     if (newest == kNoTid) return;
     if (subscription.next == kNoTid) subscription.next = newest;
-    if (subscription.next < reader.oldest_tid()) {
-      left_out_ += static_cast<std::uint64_t>(reader.oldest_tid() - subscription.next);
-      subscription.next = reader.oldest_tid();
-    }
+    leave_out_before(subscription, reader.oldest_tid());
     for (int i = 0; i < kMaxTurnSamples && subscription.next <= newest; ++i) {
       if (peer_.waiting_bytes() >= kMaxWaitingBytes) {
-        left_out_ += static_cast<std::uint64_t>(newest + 1 - subscription.next);
-        subscription.next = newest + 1;
-        return;
+        return leave_out_before(subscription, newest + 1);
       }
       BorrowedSample sample;
       const ReadStatus status = reader.borrow(subscription.next, sample);

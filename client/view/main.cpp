@@ -136,7 +136,12 @@ Result<void> serve(Options options) {
   }
   server.repeat(FoxgloveClients::kSendPeriod, [&] { foxglove.send_samples(); });
   server.repeat(kClosePeriod, [&] { streams.close_unused(); });
-  if (recorded) server.repeat(kStatePeriod, [&] { on_state(*recorded); });
+  if (recorded) {
+    server.repeat(kStatePeriod, [&] {
+      show_warnings(std::get<Recording>(source), *recorded);
+      on_state(*recorded);
+    });
+  }
   const std::uint16_t port = DSSM_TRY(server.listen());
   if (session) {
     collector->start(

@@ -125,13 +125,17 @@ VehicleState recorded_state(const Recording& recording) {
          {"text", fmt::format("{} on {}{}{}", trigger.name, trigger.host,
                               trigger.reason.empty() ? "" : ": ", trigger.reason)}});
   }
+  json["error"] = "";
+  show_warnings(recording, state);
+  return state;
+}
+
+void show_warnings(const Recording& recording, VehicleState& state) {
   std::vector<ctl::Finding> findings;
   for (const std::string& warning : recording.warnings()) {
     findings.push_back({"recording", ctl::Finding::Status::warn, warning});
   }
-  json["findings"] = ctl::findings_json(findings);
-  json["error"] = "";
-  return state;
+  state.json["findings"] = ctl::findings_json(findings);
 }
 
 void StateCollector::start(std::function<void(const VehicleState&)> on_state) {
@@ -259,9 +263,11 @@ void StateCollector::find_events(const std::vector<HostInfo>& hosts) {
     if (stream.id.name == ctl::kIncidentStream) find_incidents(stream);
     if (ctl::is_of_black_box(stream.id)) continue;
     const std::string name = stream.id.str();
-    new_streams[name] = stream.state;
-    if (is_first) continue;
     const auto known = streams_.find(name);
+    // Of a host that does not answer just now, nothing is known; then the last state counts.
+    const bool is_unknown = stream.state == StreamState::unknown && known != streams_.end();
+    new_streams[name] = is_unknown ? known->second : stream.state;
+    if (is_first) continue;
     if (known == streams_.end()) {
       add_event(false, fmt::format("stream {} was created", name));
       continue;

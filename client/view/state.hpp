@@ -43,6 +43,8 @@ struct VehicleState {
 
 // The one that a recording shows: its streams, its triggers as events, its warnings as findings.
 VehicleState recorded_state(const Recording& recording);
+// Its warnings again: what is damaged in the midst of a file is found when that is read.
+void show_warnings(const Recording& recording, VehicleState& state);
 
 class StateCollector {
  public:

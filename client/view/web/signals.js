@@ -18,6 +18,7 @@ import {
 
 const kPeriodMs = 100;
 const kOpeningMs = 100;
+const kArrivingMs = 500;
 const kPoints = 800;
 const kExportPoints = 20000; // the most that is answered
 const kSpans = [1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1800, 3600]; // seconds
@@ -111,8 +112,10 @@ export class Signals extends EventTarget {
     if (this.panels.length > 0 || this.suggested || this.streams().length === 0) return;
     this.suggested = true;
     const known = [];
+    let isAnyMissing = false;
     for (const { stream } of this.streams()) {
       const type = await this.types.ask(stream);
+      isAnyMissing ||= !type;
       const names = type
         ? signalsOf(type)
             .filter((one) => !one.count)
@@ -120,6 +123,10 @@ export class Signals extends EventTarget {
         : [];
       if (names.length > 0)
         known.push({ stream, names, isArray: ["scan", "image"].includes(guessKind(type)) });
+    }
+    if (known.length === 0 && isAnyMissing) {
+      this.suggested = false; // again, with the next overview
+      return;
     }
     known.sort((a, b) => Number(a.isArray) - Number(b.isArray));
     for (const { stream, names } of known.slice(0, kFewPanels)) {
@@ -420,12 +427,14 @@ export class Signals extends EventTarget {
     if (this.root.hidden) return null;
     const live = this.time.mode === "live";
     let opening = false;
+    let arriving = false; // what is held is still on its way
     let newest = null;
     for (const stream of this.chosenStreams()) {
       const type = await this.types.ask(stream);
       if (!type) continue;
       const answer = await this.askStream(stream, type, live, kPoints);
-      opening ||= answer.status === "opening";
+      opening ||= answer.status === "opening" || answer.status === "restarted";
+      arriving ||= !live && answer.status === "arriving";
       if (answer.to && (newest === null || answer.to > newest)) newest = answer.to;
     }
     if (live && this.time.mode === "live" && newest !== null) {
@@ -434,6 +443,7 @@ export class Signals extends EventTarget {
     for (const panel of this.panels) this.draw(panel);
     this.drawCursor();
     if (opening) return kOpeningMs;
+    if (arriving) return kArrivingMs;
     return live && this.panels.length > 0 ? 0 : null;
   }
 
@@ -470,6 +480,7 @@ export class Signals extends EventTarget {
         status: head.status,
         error: head.error ?? "",
         lost: head.lost ?? 0,
+        leftOut: head.left_out ?? 0,
         count: head.samples ?? 0,
         clockErrorS: head.clock_error_s ?? null,
       });
@@ -525,6 +536,9 @@ export class Signals extends EventTarget {
       else if (!isUsual) notes.push(`${stream}: ${answer.status.replaceAll("_", " ")}`);
       else if (isEmpty) notes.push(`${stream}: no samples in this window`);
       if (answer.lost > 0) notes.push(`${stream}: ${answer.lost} samples lost in this window`);
+      if (answer.leftOut > 0) {
+        notes.push(`${stream}: ${answer.leftOut} samples more than are read at once; zoom in`);
+      }
     }
     return notes.join("; ");
   }
@@ -602,10 +616,12 @@ export class Signals extends EventTarget {
     const { from, to } = this.window;
     const rows = new Map(); // ns -> cells
     const columns = ["time_ns"];
+    const notes = [];
     for (const stream of this.chosenStreams()) {
       const type = await this.types.ask(stream);
       if (!type) continue;
       const answer = await this.exportOf(stream, type);
+      if (answer.leftOut > 0) notes.push(`not in the file: ${answer.leftOut} samples of ${stream}`);
       const tidColumn = columns.push(`${stream} tid`) - 1;
       for (const [field, curve] of answer.curves) {
         const column = columns.push(`${stream} ${field}`) - 1;
@@ -619,6 +635,7 @@ export class Signals extends EventTarget {
         }
       }
     }
+    setText(this.root.querySelector("#export-note"), notes.join("; "));
     const quoted = (text) => (/[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
     const lines = [columns.map(quoted).join(",")];
     for (const [ns, cells] of [...rows].sort(([a], [b]) => (a < b ? -1 : 1))) {

@@ -100,6 +100,10 @@ export class Views extends EventTarget {
 
   showStreams() {
     const names = this.streams().map((stream) => stream.stream);
+    // A stream was recreated, or its type could not be had.
+    for (const card of this.cards) {
+      if (!card.type || this.types.get(card.stream) !== card.type) card.prepare();
+    }
     const key = JSON.stringify(names);
     if (key === this.names) return;
     this.names = key;

@@ -33,6 +33,12 @@ struct PlanarPose {
 };
 DSSM_DESCRIBE(PlanarPose, x_m, y_m, theta_rad)
 
+struct Lamp {
+  double watts;
+  std::int32_t is_on;
+};
+DSSM_DESCRIBE(Lamp, watts, is_on)
+
 constexpr char kMotion[] = "motion:0@pc1";
 
 class ViewPage : public ViewTest {
@@ -148,6 +154,17 @@ TEST_F(ViewPage, DrawsScansPosesImagesAndBytes) {
   expect_ok("views", {"scan:0@pc1", "pose:0@pc1", "camera:0@pc1", "raw:0@pc1"});
 }
 
+TEST_F(ViewPage, ShowsTheFieldsOfAStreamThatIsCreatedAgain) {
+  auto wheels = std::optional(session_.create<Wheels>("thing", depth_of(8)).value());
+  wheels->write({});
+  Running page(page_argv("recreated", {"thing:0@pc1", "watts"}), {});
+  ASSERT_EQ(page.line(), "shown") << page.rest();
+  ASSERT_TRUE(session_.remove(wheels->id()));
+  auto lamp = session_.create<Lamp>("thing", depth_of(8)).value();
+  lamp.write({40, 1});
+  lines(page, [] {});
+}
+
 TEST_F(ViewPage, ExportsWhatThePlotsShow) {
   constexpr int kSamples = 100;
   constexpr std::int64_t kCycle = 10'000'000;  // ns
@@ -202,7 +219,8 @@ TEST_F(ViewPage, ShowsTheDriveOfTheExample) {
          "--speed", "20", "--to", "50", "--start-at", start_at},
         {dssmd.environment()});
   };
-  Running localizer({built(programs + "localizer")}, {daemon_.environment()});
+  // Both programs may be slow, but no scan is to be left out.
+  Running localizer({built(programs + "localizer"), "--deadline", "60"}, {daemon_.environment()});
   Running encoder = replay("encoder", daemon_), lidar = replay("lidar", pc2_);
   // Of a program of SSM, which describes nothing: the fields are in its debug information.
   Json odometry;

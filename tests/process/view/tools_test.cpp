@@ -76,7 +76,7 @@ TEST_F(ViewTools, LetPrometheusRaiseAnAlert) {
   const TestFolder folder;
   const std::string address = url_.substr(7, url_.size() - 8);
   std::ofstream(folder.file("prometheus.yml")) << "global:\n"
-                                                  "  scrape_interval: 200ms\n"
+                                                  "  scrape_interval: 2s\n"  // and its timeout
                                                   "  evaluation_interval: 200ms\n"
                                                   "rule_files: [rules.yml]\n"
                                                   "scrape_configs:\n"
