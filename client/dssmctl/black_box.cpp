@@ -48,10 +48,13 @@ class BlackBox {
         fmt::format("trigger '{}' of host '{}'{}", escaped(trigger.name), escaped(trigger.host),
                     trigger.reason.empty() ? "" : ": " + escaped_message(trigger.reason));
     if (recorder_.is_recording()) {
-      notice(fmt::format("{}; '{}' continues", text, escaped(file_.string())));
-      end_ = std::min(deadline_in(options_.after), last_end_);
-      (void)recorder_.add_trigger(trigger);  // take() fails in the same way
-      return;
+      const Result<void> added = recorder_.add_trigger(trigger);
+      if (added) {
+        notice(fmt::format("{}; '{}' continues", text, escaped(file_.string())));
+        end_ = std::min(deadline_in(options_.after), last_end_);
+        return;
+      }
+      end_incident(&added.error());  // and this is one of its own
     }
     const Result<void> begun = begin_incident(trigger);
     notice(begun ? fmt::format("{}; records '{}'", text, escaped(file_.string()))

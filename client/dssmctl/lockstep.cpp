@@ -320,7 +320,7 @@ Result<bool> Lockstep::await_start() {
   bool noticed = false;
   for (const auto& program : programs_) {
     // Until it has waited for a while, and nothing has changed.
-    MonoTime quiet_since = kNever;
+    MonoTime quiet_since = kNever, unchanged_since = MonoClock::now();
     std::uint64_t turns = 0;
     while (program->runs) {
       if (!DSSM_TRY(check_ends())) return false;
@@ -330,8 +330,9 @@ Result<bool> Lockstep::await_start() {
                       [](const LockstepPlace& place) {
                         return place.state.load() == LockstepPlace::waiting;
                       }) &&
-          is_waiting(*program, true, now - begin > kElsewhere + kStartQuiet);
+          is_waiting(*program, true, now - unchanged_since > kElsewhere + kStartQuiet);
       const std::uint64_t taken = turns_taken(*program);
+      if (taken != turns) unchanged_since = now;
       if (!waits || taken != turns) {
         quiet_since = kNever;
         turns = taken;

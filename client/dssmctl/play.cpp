@@ -503,9 +503,13 @@ class Player {
 
 Result<void> run(const PlayOptions& options, Output& out) {
   const Recording recording = DSSM_TRY(open_recording(options.file, options.more_files));
-  for (const std::string& warning : recording.warnings()) {
-    print_notice(escaped_message(warning));
-  }
+  std::size_t told = 0;
+  // What is damaged in the midst of a file is found when that is read.
+  const auto tell_warnings = [&] {
+    const std::vector<std::string> warnings = recording.warnings();
+    for (; told < warnings.size(); ++told) print_notice(escaped_message(warnings[told]));
+  };
+  tell_warnings();
   const PlayedPart range = DSSM_TRY(played_part(recording, options));
   Session session = DSSM_TRY(connect(options));
   std::optional<PlaybackClock> clock;
@@ -528,6 +532,7 @@ Result<void> run(const PlayOptions& options, Output& out) {
     clock->reset();
   }
   player.print_summary();
+  tell_warnings();
   return played;
 }
 

@@ -334,8 +334,13 @@ Result<void> Recorder::end() {
 
 Result<void> Recorder::take() {
   auto properties = opener_.take_properties();
-  for (Source& opened : opener_.take_opened()) DSSM_TRY(add(std::move(opened)));
+  // All, also when the file cannot take them, because its disk is full: the next file will.
+  Result<void> added;
+  for (Source& opened : opener_.take_opened()) {
+    if (Result<void> one = add(std::move(opened)); !one && added) added = std::move(one);
+  }
   for (auto& [id, property] : properties) add_property(id, std::move(property));
+  DSSM_TRY(std::move(added));
   if (!is_recording_) {
     check_readers();
     next_take_ = deadline_in(kMaxPeriod);
@@ -380,11 +385,11 @@ Duration Recorder::next_period() {
 }
 
 Result<void> Recorder::add(Source source) {
-  if (is_recording_ && is_on_demand_) want_past(source);
-  if (is_recording_) DSSM_TRY(add_to_file(source));
-  sources_.push_back(std::move(source));
   period_ = kMinPeriod;  // how quickly its ring fills is not known yet
-  return {};
+  Source& added = sources_.emplace_back(std::move(source));
+  if (!is_recording_) return {};
+  if (is_on_demand_) want_past(added);
+  return add_to_file(added);
 }
 
 Result<void> Recorder::add_to_file(Source& source) {

@@ -147,10 +147,10 @@ Result<void> show_on_terminal(const Session& session, TopState state, const TopO
   bool was_connected = true, is_changed = true;
   ScreenSize drawn_size;
   for (std::uint64_t updates = 1; !out.must_stop();) {
-    if (auto newer = reader.take(); newer && !display.is_held()) {
+    if (auto newer = reader.take()) {
       display.set_state(std::move(*newer));
       is_changed = true;
-      ++updates;
+      if (!display.is_held()) ++updates;
     }
     const bool is_connected = session.is_connected();
     if (std::exchange(was_connected, is_connected) != is_connected) {

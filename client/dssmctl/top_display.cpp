@@ -305,7 +305,12 @@ TopDisplay::TopDisplay(const TopOptions& options) : iso_(options.iso), view_(opt
 }
 
 void TopDisplay::set_state(TopState state) {
-  if (state.error.empty()) {
+  if (is_held_) {
+    if (!state_.programs) state_.programs = std::move(state.programs);
+    const bool is_new =
+        state.details && (!state_.details || state_.details->id != state.details->id);
+    if (is_new) state_.details = std::move(state.details);
+  } else if (state.error.empty()) {
     // Until others come, the last ones are shown.
     if (!state.programs) state.programs = std::move(state_.programs);
     state_ = std::move(state);

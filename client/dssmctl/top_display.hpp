@@ -59,7 +59,8 @@ class TopDisplay {
   // The options' pattern and order are those of its view.
   explicit TopDisplay(const TopOptions& options);
 
-  // What dssmd states now; with an error the last state stays, but for that.
+  // What dssmd states now; with an error the last state stays, but for that. While the display is
+  // held, only what it does not have yet is taken over: programs, and the details of a stream.
   void set_state(TopState state);
   void set_connected(bool is_connected) { is_connected_ = is_connected; }
 

@@ -45,8 +45,13 @@ Result<void> request(Session& session, const StreamInfo& stream, const TriggerRe
 Result<void> run(const TriggerOptions& options, Output& out) {
   Session session = DSSM_TRY(connect(options));
   std::vector<StreamInfo> recorders = DSSM_TRY(session.list_streams());
-  std::erase_if(recorders, [](const StreamInfo& stream) {
-    return stream.id.name != kTriggerStream || stream.readers == 0;
+  std::erase_if(recorders, [&](const StreamInfo& stream) {
+    if (stream.id.name != kTriggerStream) return true;
+    if (stream.readers > 0) return false;
+    if (stream.state != StreamState::unknown) return true;
+    // Its host did not answer in time for the list.
+    const Result<StreamInfo> now = session.stream_info(stream.id);
+    return now && now->state != StreamState::unknown && now->readers == 0;
   });
   if (recorders.empty()) {
     return Error{Errc::not_found,

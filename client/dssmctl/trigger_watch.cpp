@@ -197,7 +197,8 @@ void TriggerEvaluator::on_lists(const std::vector<StreamInfo>& streams,
       known = {stream.id, stream.incarnation, stream.crashed_writers, false};
     }
     for (const TriggerRule& rule : rules_) check_stream(rule, stream, known, now);
-    known.crashed_writers = stream.crashed_writers;
+    // Of a host that does not answer just now, the list has an earlier number.
+    known.crashed_writers = std::max(known.crashed_writers, stream.crashed_writers);
     known.live = stream.state == StreamState::live || (known.live && !is_silent(stream));
   }
   // A host that is lost takes its streams from the list.
@@ -331,13 +332,18 @@ void TriggerWatch::subscribe_requests() {
   const Result<Writer<TriggerRequest>> created = session_.create<TriggerRequest>(
       kTriggerStream, History{64, kPeriod}, {.keep_existing = true});
   if (!created) return report(created.error());
+  // Not by time: a host that sends a request may have a clock that is behind.
+  if (!earlier_requests_) {
+    earlier_requests_.emplace(created->incarnation(), created->newest_tid());
+  }
   SubscribeOptions options;
   options.which = WhichSamples::each_from_oldest;
   options.on_error = report;
   Result<StreamCallback> requests = session_.subscribe<TriggerRequest>(
       created->id().str(),
-      [this](const Sample<TriggerRequest>& sample) {
-        if (sample.time() < started_) return;  // of a recorder that was here before
+      [this](const Sample<TriggerRequest>& sample, Reader<TriggerRequest>& reader) {
+        const auto [ring, newest] = *earlier_requests_;
+        if (reader.incarnation() == ring && sample.tid() <= newest) return;
         const std::lock_guard lock(mutex_);
         evaluator_.on_request(sample.value, sample.time());
       },
@@ -369,7 +375,9 @@ void TriggerWatch::subscribe_fields(const std::vector<StreamInfo>& streams) {
     if (!evaluator_.has_rule_on(stream.id)) continue;
     const std::pair key(stream.id.str(), stream.incarnation);
     listed.insert(key);
-    if (fields_.contains(key)) continue;
+    FieldWatch& watch = fields_[key];
+    if (watch.subscription || MonoClock::now() < watch.retry_at) continue;
+    watch.retry_at = deadline_in(kRetryPeriod);
     TypeInfo type = stream.type;
     if (type.fields.empty()) {  // lists leave out the fields of many types
       const Result<StreamInfo> info = session_.stream_info(stream.id);
@@ -378,7 +386,6 @@ void TriggerWatch::subscribe_fields(const std::vector<StreamInfo>& streams) {
     }
     std::vector<TriggerEvaluator::Check> checks =
         evaluator_.checks_of(stream.id, readable_fields_untrusted(type));
-    std::optional<StreamCallback>& subscription = fields_[key];
     if (checks.empty()) {
       notice(fmt::format("no trigger on '{}': it has no such field", escaped(stream.id.str())));
       continue;
@@ -396,7 +403,7 @@ void TriggerWatch::subscribe_fields(const std::vector<StreamInfo>& streams) {
         },
         options, &type);
     if (subscribed) {
-      subscription = *std::move(subscribed);
+      watch.subscription = *std::move(subscribed);
     } else {
       options.on_error(subscribed.error());
     }

@@ -132,9 +132,9 @@ class TriggerWatch {
   void notice(const std::string& text);
 
   static constexpr Duration kPeriod = std::chrono::seconds(1);
+  static constexpr Duration kRetryPeriod = std::chrono::seconds(5);
 
   Session session_;
-  const Time started_ = WallClock::now();
 
   std::mutex mutex_;
   std::condition_variable stopped_;
@@ -146,8 +146,14 @@ class TriggerWatch {
   // --- of the thread
   std::optional<StreamCallback> requests_;
   StreamId request_stream_;
-  // By name with host and incarnation; without a value: it has no field with a condition.
-  std::map<std::pair<std::string, std::uint64_t>, std::optional<StreamCallback>> fields_;
+  // Incarnation of that stream and its newest request when this began: for a recorder before it.
+  std::optional<std::pair<std::uint64_t, Tid>> earlier_requests_;
+  // Of a stream that may have fields with conditions. One that has none may be described later.
+  struct FieldWatch {
+    std::optional<StreamCallback> subscription;
+    MonoTime retry_at{};
+  };
+  std::map<std::pair<std::string, std::uint64_t>, FieldWatch> fields_;  // by name and incarnation
   std::thread thread_;
 };
 

@@ -58,7 +58,9 @@ TEST_F(Lockstep, GivesProgramsAllAndInTheSameOrderEachTime) {
     }
     const Finished played = ctl(words);
     ASSERT_EQ(played.exit_status, 0) << played.err;
-    EXPECT_EQ(played.err, "");
+    for (const std::string& line : lines_of(played.err)) {  // on a slow machine
+      EXPECT_TRUE(line.starts_with("dssmctl: play: waiting until '")) << played.err;
+    }
     EXPECT_TRUE(session_.remove({"echo", 0, ""}));
     std::vector<std::string> texts;
     for (const std::string& way : ways) texts.push_back(text_of(folder_.file(way)));

@@ -171,8 +171,9 @@ TEST_F(Record, HasThePropertyOfAStreamThatRestarts) {
 TEST_F(Record, OfThePastTakesWhatTheRingsHoldOfThatTimeAndEnds) {
   auto pose = session_.create<RecordedPose>("pose", depth_of(256)).value();
   const Time now = WallClock::now();
-  for (int i = 0; i < 100; ++i) pose.write({0, 0, i}, now - 100s + i * 1s);
-  const std::string text = output({"record", "--past", "30.5s", "-o", file_});
+  // Half a minute may pass until dssmctl begins.
+  for (int i = 0; i < 100; ++i) pose.write({0, 0, i}, now - 100min + i * 1min);
+  const std::string text = output({"record", "--past", "1830s", "-o", file_});
   RecordedReader<RecordedPose> reader = recorded(file_, "pose");
   for (int i = 70; i < 100; ++i) {
     const auto sample = reader.read_next();
@@ -442,6 +443,22 @@ TEST_F(Play, GivesBackWhatWasRecorded) {
   EXPECT_EQ(info.depth, 512U);
   EXPECT_EQ(info.cycle, 1ms);
   EXPECT_EQ(property(), 8) << "the one at the end";
+}
+
+// Its index is whole, so this is found only while it is played.
+TEST_F(Play, SaysThatAPartIsDamaged) {
+  make_recording();
+  std::string content = text_of(file_);
+  constexpr char kChunk = 6;  // MCAP's records: this byte, the length, the content
+  for (std::size_t at = 8; at + 9 < content.size();) {
+    std::uint64_t bytes = 0;
+    std::memcpy(&bytes, &content[at + 1], sizeof bytes);
+    if (content[at] == kChunk) content[at + 9 + bytes - 20] ^= 1;
+    at += 9 + bytes;
+  }
+  std::ofstream(file_) << content;
+  const Finished played = ctl({"play", file_});
+  EXPECT_TRUE(contains(played.err, "'" + file_ + "'")) << played.err << played.out;
 }
 
 TEST_F(Play, SetsThePropertyOfTheTimeAtWhichItIs) {
