@@ -66,6 +66,8 @@ TEST_F(BadPeer, ThatSendsRandomBytesCostsOnlyItself) {
     peer.send_bytes(bytes);
     ::shutdown(peer.fd(), SHUT_WR);
     peer.await_end();
+    // Often: dssmd closes what is silent for 10 s.
+    EXPECT_TRUE(good_.ask(list_frame()).has_stream_list());
   }
 }
 
@@ -278,7 +280,7 @@ TEST_F(BadPeer, TwentyThousandOfAllKindsLeaveNothingBehind) {
     const Result<UniqueFd> program = wire::connect_unix(daemon_.socket_path());
     ASSERT_TRUE(program) << program.error().message;
     misuse(program->get(), random, local_hello);
-    if (i % 1000 == 0) {
+    if (i % 50 == 0) {
       EXPECT_TRUE(good_.ask(list_frame()).has_stream_list());
     }
   }

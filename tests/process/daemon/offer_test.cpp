@@ -28,9 +28,13 @@ class Offer : public testing::Test {
  protected:
   // Creates a stream, sets its property, and kills dssmd; gives what the writer holds.
   std::vector<UniqueFd> hold_through_crash(const std::string& name, bool as_writer = true) {
+    return hold_through_crash(daemon_, name, as_writer);
+  }
+  static std::vector<UniqueFd> hold_through_crash(DaemonProcess& daemon, const std::string& name,
+                                                  bool as_writer) {
     std::vector<UniqueFd> held;
     {
-      RawClient client(daemon_.socket_path());
+      RawClient client(daemon.socket_path());
       Answer created = client.ask(create_request(name));
       EXPECT_TRUE(created.response.has_opened()) << created.response.failure().message();
       local::Request set;
@@ -40,8 +44,8 @@ class Offer : public testing::Test {
       held = as_writer ? std::move(created.descriptors)
                        : std::move(client.ask(open_request(name)).descriptors);
     }
-    daemon_.kill_hard();
-    daemon_.start();
+    daemon.kill_hard();
+    daemon.start();
     return held;
   }
 
@@ -149,8 +153,9 @@ TEST_F(Offer, OfAnotherRingThanTheRegisteredOneIsAConflict) {
 }
 
 TEST_F(Offer, ComesBeforeAFreshWriterThatAskedEarlier) {
-  const std::vector<UniqueFd> held = hold_through_crash("odometry");
-  RawClient fresh(daemon_.socket_path()), old(daemon_.socket_path());
+  DaemonProcess patient({"--recovery-grace", "60 s", "--log-level", "error"});
+  const std::vector<UniqueFd> held = hold_through_crash(patient, "odometry", true);
+  RawClient fresh(patient.socket_path()), old(patient.socket_path());
   fresh.send(create_request("odometry"));
   ASSERT_TRUE(old.ask(offer_request("odometry", true), numbers(held)).response.has_opened());
   const Answer joined = fresh.receive();
