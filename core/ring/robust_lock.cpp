@@ -26,6 +26,7 @@ static_assert(kLockBytes == kNodeAfterWord - sizeof(void*));
 
 // Sleepers look again after this time: whoever may map the word can take a sleeper off its queue.
 constexpr Duration kMaxSleepOnWord = std::chrono::milliseconds(20);
+constexpr Duration kAttemptTime = std::chrono::nanoseconds(20);  // about, to change the word
 
 constexpr Duration kClaimPause = std::chrono::microseconds(100);
 
@@ -105,6 +106,7 @@ LockResult take_word(std::atomic<std::uint32_t>& word, std::uint32_t id, Duratio
     if (patience <= Duration::zero()) return LockResult::busy;
     if (!(found & FUTEX_WAITERS) &&
         !word.compare_exchange_weak(found, found | FUTEX_WAITERS, std::memory_order_relaxed)) {
+      patience -= kAttemptTime;
       continue;
     }
     const MonoTime begin = MonoClock::now();
@@ -209,8 +211,9 @@ RobustLock::Private& RobustLock::own() const noexcept {
       give_back(word(), result == LockResult::recovered ? FUTEX_OWNER_DIED : 0);
       result = LockResult::busy;
       if (patience <= Duration::zero()) break;
-      patience -= kClaimPause;
+      const MonoTime begin = MonoClock::now();
       sleep_for(kClaimPause);
+      patience -= std::min(MonoClock::now() - begin, kMaxSleepOnWord);
     }
     if (result == LockResult::busy) {
       if (may_wait) own.was_in_vain.store(true, std::memory_order_relaxed);

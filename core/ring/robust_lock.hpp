@@ -39,7 +39,7 @@ enum class LockResult : unsigned char {
 // A mapped lock. Thread-safe; of this process's threads as of all others, one holds it.
 class RobustLock {
  public:
-  // How long lock() waits in all, not counting time in which this process stands still; and how
+  // How long lock() waits in all, not counting time in which the thread stands still; and how
   // long after it did so in vain, until a thread of this mapping got the lock: a holder is stopped,
   // or the word is damaged, and the caller has other work.
   static constexpr Duration kMaxWait = std::chrono::seconds(2);

@@ -112,6 +112,7 @@ TEST(RobustLock, CountsNoTimeInWhichTheProcessStandsStill) {
     waiter.join();
     ::_exit(result == LockResult::locked ? 0 : 1);
   }
+  ::close(waits[1]);
   ASSERT_EQ(::read(waits[0], &byte, 1), 1);
   ASSERT_EQ(::kill(child, SIGSTOP), 0);
   std::this_thread::sleep_for(RobustLock::kMaxWait + std::chrono::milliseconds(100));
@@ -122,7 +123,7 @@ TEST(RobustLock, CountsNoTimeInWhichTheProcessStandsStill) {
   int status = 0;
   ASSERT_EQ(::waitpid(child, &status, 0), child);
   EXPECT_EQ(status, 0);
-  for (const int fd : {waits[0], waits[1], go[0], go[1]}) ::close(fd);
+  for (const int fd : {waits[0], go[0], go[1]}) ::close(fd);
 }
 
 TEST(RobustLock, WakesAThreadThatWaits) {
