@@ -83,9 +83,9 @@ Result<std::shared_ptr<Client>> Client::connect(SessionOptions options) {
 
 Result<void> Client::set_up() {
   NewConnection connection = DSSM_TRY(NewConnection::greet(options_, ++connections_));
-  open_clock_page(connection);
-  streams_.offer_all(connection);
-  offer_playback_clock(connection);
+  DSSM_TRY(open_clock_page(connection));
+  DSSM_TRY(streams_.offer_all(connection));
+  DSSM_TRY(offer_playback_clock(connection));
   connection.fds().clear();
   const std::vector<std::uint64_t> replaced = connection.replaced();
   connection_.use(std::move(connection));
@@ -97,28 +97,32 @@ Result<void> Client::set_up() {
 
 // Without a page, or with one of another version, nothing is known of the clock; the connection
 // works nevertheless.
-void Client::open_clock_page(NewConnection& connection) {
+Result<void> Client::open_clock_page(NewConnection& connection) {
   local::Request request;
   request.mutable_open_clock_page();
   const auto answer = connection.exchange(std::move(request));
-  if (!answer || connection.fds().empty()) return;
+  if (!answer && answer.error().code == Errc::unavailable) return answer.error();
+  if (!answer || connection.fds().empty()) return {};
   const Result<const clock::ClockPage*> page =
       clock::map_clock_page_untrusted(connection.fds().front().get());
-  if (!page) return;
+  if (!page) return {};
   clock_page_.store(*page, std::memory_order_release);
   latest_clock_page().store(*page, std::memory_order_release);
+  return {};
 }
 
-void Client::offer_playback_clock(NewConnection& connection) {
+Result<void> Client::offer_playback_clock(NewConnection& connection) {
   int fd = -1;
   {
     const std::lock_guard guard(playback_mutex_);
     fd = playback_fd_.get();  // set once, closed only with the client
   }
-  if (fd < 0) return;
+  if (fd < 0) return {};
   local::Request request;
   request.mutable_open_clock()->set_offered(true);
-  [[maybe_unused]] const auto answer = connection.exchange(std::move(request), std::span(&fd, 1));
+  const auto answer = connection.exchange(std::move(request), std::span(&fd, 1));
+  if (!answer && answer.error().code == Errc::unavailable) return answer.error();
+  return {};
 }
 
 bool Client::pause(Duration time) const {

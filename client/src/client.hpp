@@ -66,8 +66,8 @@ class Client : public std::enable_shared_from_this<Client> {
   friend struct OpenStream;
 
   Result<void> set_up();  // one attempt
-  void open_clock_page(NewConnection& connection);
-  void offer_playback_clock(NewConnection& connection);
+  Result<void> open_clock_page(NewConnection& connection);
+  Result<void> offer_playback_clock(NewConnection& connection);
   void run();                       // the thread
   bool pause(Duration time) const;  // false: the client is being destroyed
   void close(const OpenStream& stream);

@@ -138,7 +138,7 @@ void OpenStreams::close(const OpenStream& stream) {
   if (handle != 0) connection_.post(close_request(handle), connection);
 }
 
-void OpenStreams::offer_all(NewConnection& connection) {
+Result<void> OpenStreams::offer_all(NewConnection& connection) {
   std::vector<std::uint64_t> keys;
   {
     const std::lock_guard guard(mutex_);
@@ -149,23 +149,25 @@ void OpenStreams::offer_all(NewConnection& connection) {
       keys.push_back(key);
     }
   }
-  for (const std::uint64_t key : keys) offer(connection, key);
+  for (const std::uint64_t key : keys) DSSM_TRY(offer(connection, key));
+  return {};
 }
 
 // Without the mutex while dssmd answers: the stream may be closed meanwhile.
-void OpenStreams::offer(NewConnection& connection, std::uint64_t key) {
+Result<void> OpenStreams::offer(NewConnection& connection, std::uint64_t key) {
   local::Request request;
   std::shared_ptr<const SharedRing> ring;
   std::vector<int> fds;
   {
     const std::lock_guard guard(mutex_);
     const auto entry = streams_.find(key);
-    if (entry == streams_.end()) return;
+    if (entry == streams_.end()) return {};
     request = offer_request(*entry->second);
     ring = entry->second->ring;
     fds = fds_of(*ring, entry->second->role);
   }
   const auto opened = connection.exchange(std::move(request), fds);
+  if (!opened && opened.error().code == Errc::unavailable) return opened.error();
   std::uint64_t unused_handle = 0;
   {
     const std::lock_guard guard(mutex_);
@@ -174,14 +176,16 @@ void OpenStreams::offer(NewConnection& connection, std::uint64_t key) {
     if (!opened) {
       // Refused: its users keep this ring, which gets nothing more if it is a mirror. Readers
       // continue with the ring that has its name now, as soon as there is one that they may have.
-      if (is_open && opened.error().code != Errc::unavailable) entry->second->supersede();
+      if (is_open) entry->second->supersede();
     } else if (opened->has_opened()) {
       (is_open ? entry->second->handle_ : unused_handle) = opened->opened().handle();
     }
   }
   if (unused_handle != 0) {
-    [[maybe_unused]] const auto closed = connection.exchange(close_request(unused_handle));
+    const auto closed = connection.exchange(close_request(unused_handle));
+    if (!closed && closed.error().code == Errc::unavailable) return closed.error();
   }
+  return {};
 }
 
 void OpenStreams::post_wishes(bool all) {

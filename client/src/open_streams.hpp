@@ -67,7 +67,8 @@ struct OpenStream {
   OpenStream& operator=(const OpenStream&) = delete;
   ~OpenStream();
 
-  // Marks that the stream has another ring now, and wakes the readers that sleep on this one.
+  // Marks that the stream has another ring now, or that dssmd did not take this one, and wakes the
+  // readers that sleep on it.
   void supersede() const noexcept;
 
   const std::shared_ptr<Client> client;
@@ -78,7 +79,7 @@ struct OpenStream {
   const std::uint32_t tag;
   const FetchHistory history;
   const std::shared_ptr<const SharedRing> ring;
-  // Set once: the stream has another ring. Shared with the reader's ReadyFd.
+  // Set once, by supersede(). Shared with the reader's ReadyFd.
   const std::shared_ptr<std::atomic<bool>> superseded = std::make_shared<std::atomic<bool>>(false);
   // Whether the program has read what is missing in the mirror; and since dssmd was told last.
   mutable std::atomic<bool> wishes = false, wish_is_new = false;
@@ -101,14 +102,15 @@ class OpenStreams {
   void close(const OpenStream& stream);
 
   // Offers all streams on a connection that is being set up.
-  void offer_all(NewConnection& connection);
+  //   fails  unavailable: the connection cannot be used, a late answer would be taken for another's
+  Result<void> offer_all(NewConnection& connection);
   // Tells dssmd which mirrors' history is read: new wishes, or after a reconnect all.
   void post_wishes(bool all);
   // dssmd has replaced the ring of this handle.
   void on_replaced(std::uint64_t handle);
 
  private:
-  void offer(NewConnection& connection, std::uint64_t key);
+  Result<void> offer(NewConnection& connection, std::uint64_t key);
 
   DaemonConnection& connection_;
   std::mutex mutex_;              // guards all that follows

@@ -132,11 +132,14 @@ bool ReaderState::restart() noexcept {
   Client& client = *stream->client;
   // Only dssmd can open the new ring, and a read must not wait until dssmd is available.
   if (to_ns(now.time_since_epoch()) < next_attempt_ns || !client.connection().is_up()) return false;
-  next_attempt_ns = to_ns((now + kRestartPause).time_since_epoch());
   auto newer = client.open_reader(stream->requested, stream->tag, stream->history);
+  const bool is_refused =
+      !newer && newer.error().code != Errc::not_found && newer.error().code != Errc::unavailable;
+  // After the request, for which a dssmd that hangs may have let this wait.
+  next_attempt_ns =
+      to_ns((MonoClock::now() + (is_refused ? kRefusedPause : kRestartPause)).time_since_epoch());
   if (!newer) {
     if (newer.error().code == Errc::no_permission) {
-      next_attempt_ns = to_ns((now + kRefusedPause).time_since_epoch());
       restart_error =
           std::move(newer).error().context("continue to read '" + stream->requested.str() + "'");
     }

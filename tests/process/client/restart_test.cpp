@@ -187,7 +187,7 @@ TEST(Restart, ReadersGoOnThatTheNextDaemonHasNoPlaceForAtFirst) {
     std::ofstream(folder.file("dssmd.conf")) << text << '\n';
   };
   configure("");
-  DaemonProcess daemon({"--config", folder.file("dssmd.conf")});
+  DaemonProcess daemon({"--config", folder.file("dssmd.conf"), "--listen", ""});
   Session session = connect(daemon);
   Writer<Numbered> writer = session.create<Numbered>("s", History{16, 1ms}).value();
   Reader<Numbered> reader = session.open_reader<Numbered>("s").value();
