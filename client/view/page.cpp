@@ -115,6 +115,13 @@ Result<Message> type_answer(Streams& streams, std::uint32_t id, const Json& requ
   const Streams::Found found = streams.find(text_of(request, "stream"));
   Json json = {{"id", id}, {"stream", text_of(request, "stream")}};
   if (found.stream) {
+    // Nothing else may read it now, and a reader notices only then that its stream began anew.
+    if (auto* const live = std::get_if<RawReader>(&found.stream->reader)) {
+      BorrowedSample newest;
+      const ReadStatus status = live->borrow(live->newest_tid(), newest);
+      if (status == ReadStatus::restarted) found.stream->follow_restart();
+      json["incarnation"] = live->incarnation();
+    }
     const TypeInfo& type = found.stream->type();
     TypeInfo readable = type;
     readable.fields = found.stream->fields;

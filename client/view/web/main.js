@@ -47,12 +47,16 @@ class Types {
     const made = { type: null, failedAt: Infinity, incarnation: incarnationOf(stream) };
     this.known.set(stream, made);
     made.promise = this.request(stream).then(
-      (answer) =>
-        (made.type = {
+      (answer) => {
+        // Not the overview's, which may be older or newer.
+        made.incarnation = answer.incarnation ?? made.incarnation;
+        made.type = {
           fields: answer.fields ?? [],
           payload_bytes: answer.payload_bytes,
           name: answer.name,
-        }),
+        };
+        return made.type;
+      },
       (error) => {
         if (!(error instanceof RequestError || error instanceof LostError)) throw error;
         made.failedAt = error instanceof LostError ? -Infinity : performance.now();

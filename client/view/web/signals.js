@@ -109,7 +109,8 @@ export class Signals extends EventTarget {
 
   // Until a person has chosen: a panel with a few fields of each of the first streams.
   async suggest() {
-    if (this.panels.length > 0 || this.suggested || this.streams().length === 0) return;
+    if (this.panels.length > 0) this.suggested = true;
+    if (this.suggested || this.streams().length === 0) return;
     this.suggested = true;
     const known = [];
     let isAnyMissing = false;
