@@ -131,7 +131,7 @@ class Recorder {
   // A stream that is recorded.
   struct Source {
     RawReader reader;
-    std::uint32_t number = 0;  // in the file
+    std::uint32_t number = UINT32_MAX;  // in the file; UINT32_MAX: in none
     Tid next = kNoTid;  // what was before it is recorded, or known as lost; kNoTid: not known yet
     Tid past_until = kNoTid;          // the newest at its opening, if history is wanted
     std::optional<Time> from, until;  // samples before and after these are not wanted

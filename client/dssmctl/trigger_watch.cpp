@@ -377,13 +377,13 @@ void TriggerWatch::subscribe_fields(const std::vector<StreamInfo>& streams) {
     listed.insert(key);
     FieldWatch& watch = fields_[key];
     if (watch.subscription || MonoClock::now() < watch.retry_at) continue;
-    watch.retry_at = deadline_in(kRetryPeriod);
     TypeInfo type = stream.type;
     if (type.fields.empty()) {  // lists leave out the fields of many types
       const Result<StreamInfo> info = session_.stream_info(stream.id);
       if (!info) continue;
       type = info->type;
     }
+    watch.retry_at = deadline_in(kRetryPeriod);
     std::vector<TriggerEvaluator::Check> checks =
         evaluator_.checks_of(stream.id, readable_fields_untrusted(type));
     if (checks.empty()) {
