@@ -37,8 +37,9 @@ def beginning_and_end(printed: str) -> str:
 def unfinished(program: dict) -> str:
     """What GoogleTest's program printed in a test that did not end; empty if each did."""
     printed = program.get("stdout", "")
-    test = printed[max(printed.rfind("[ RUN "), 0) :]
-    if not test or "[       OK ]" in test or "[  FAILED  ]" in test:
+    begin = printed.rfind("[ RUN ")
+    test = printed[begin:] if begin >= 0 else ""
+    if not test or any(end in test for end in ("[       OK ]", "[  FAILED  ]", "[  SKIPPED ]")):
         return ""
     return beginning_and_end(test + "\n".join(program.get("stderr", "").splitlines()[-MAX_LINES:]))
 

@@ -81,17 +81,25 @@ std::string make_temp_dir() {
 void remove_tree(const std::string& path) { std::filesystem::remove_all(path); }
 
 std::uint16_t free_port(int socket_type) {
+  const auto [socket, port] = reserve_port(socket_type);
+  ::close(socket);
+  return port;
+}
+
+std::pair<int, std::uint16_t> reserve_port(int socket_type) {
   const int socket = ::socket(AF_INET, socket_type | SOCK_CLOEXEC, 0);
+  constexpr int kYes = 1;
   sockaddr_in address{};
   address.sin_family = AF_INET;
   address.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
   socklen_t length = sizeof address;
   auto* const any = reinterpret_cast<sockaddr*>(&address);
-  if (socket < 0 || ::bind(socket, any, length) || ::getsockname(socket, any, &length)) {
+  // The option after bind(), which else may give a port that another one has reserved so.
+  if (socket < 0 || ::bind(socket, any, length) || ::getsockname(socket, any, &length) ||
+      ::setsockopt(socket, SOL_SOCKET, SO_REUSEADDR, &kYes, sizeof kYes)) {
     fail("find a free port");
   }
-  ::close(socket);
-  return ntohs(address.sin_port);
+  return {socket, ntohs(address.sin_port)};
 }
 
 void become_nobody(const std::vector<gid_t>& groups) {
@@ -246,10 +254,12 @@ DaemonProcess::DaemonProcess(std::vector<std::string> extra, const std::string& 
     argv_.insert(argv_.end(), {"--credentials", credentials_for(host)});
   }
   argv_.insert(argv_.end(), extra.begin(), extra.end());
-  if (!listens(extra)) argv_.insert(argv_.end(), {"--listen", "127.0.0.1:0"});
+  if (!listens(extra)) {
+    const auto [socket, port] = reserve_port(SOCK_STREAM);
+    port_fd_ = socket;
+    argv_.insert(argv_.end(), {"--listen", "127.0.0.1:" + std::to_string(port)});
+  }
   start();
-  // The same address after a restart.
-  if (!listens(extra) && !addresses_.empty()) argv_.back() = addresses_.front();
 }
 
 void DaemonProcess::call(const std::string& host) {
@@ -298,6 +308,7 @@ int DaemonProcess::stop() {
 
 DaemonProcess::~DaemonProcess() {
   if (pid_ > 0) kill_hard();
+  if (port_fd_ >= 0) ::close(port_fd_);
   remove_tree(dir_);
 }
 

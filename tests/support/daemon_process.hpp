@@ -8,6 +8,7 @@
 
 #include <cstdint>
 #include <string>
+#include <utility>
 #include <vector>
 
 namespace dssm::test {
@@ -36,6 +37,9 @@ int wait_for(pid_t pid);
 
 // A port of loopback that is free at this moment, for SOCK_DGRAM or SOCK_STREAM.
 std::uint16_t free_port(int socket_type);
+// The same, which nobody else is given while the socket is open; whoever sets SO_REUSEADDR, as
+// dssmd does, may listen there. The caller closes the socket.
+std::pair<int, std::uint16_t> reserve_port(int socket_type);
 
 // For a child of a test that runs as root: makes it the user nobody, in these groups only; ends it
 // with status 100 when that fails.
@@ -106,6 +110,7 @@ class DaemonProcess {
   std::string dir_;
   std::vector<std::string> argv_;
   std::vector<std::string> addresses_;
+  int port_fd_ = -1;  // keeps its port over a restart
   pid_t pid_ = -1;
 };
 

@@ -22,7 +22,30 @@ constexpr bool kLosesSignals = false;
 #endif
 constexpr int kSignalAgainMs = 2000;
 
+int other_signal(int number) { return number == SIGINT ? SIGTERM : SIGINT; }
+
+// Whether the child exists and has not ended.
+bool runs(pid_t pid) {
+  siginfo_t end{};
+  return ::waitid(P_PID, static_cast<id_t>(pid), &end, WEXITED | WNOHANG | WNOWAIT) == 0 &&
+         end.si_pid == 0;
+}
+
 }  // namespace
+
+EndingSignal::EndingSignal(pid_t pid, int number) {
+  ::kill(pid, number);
+  if (!kLosesSignals) return;
+  again_ = std::jthread([pid, number](const std::stop_token& stop) {
+    int next = number;
+    for (MonoTime due = deadline_in(std::chrono::milliseconds(kSignalAgainMs));
+         !stop.stop_requested() && runs(pid); std::this_thread::sleep_for(kPollPause)) {
+      if (MonoClock::now() < due) continue;
+      ::kill(pid, next = other_signal(next));
+      due = deadline_in(std::chrono::milliseconds(kSignalAgainMs));
+    }
+  });
+}
 
 Running::Running(std::vector<std::string> argv, const std::vector<std::string>& environment) {
   int ends[2];
@@ -51,7 +74,7 @@ bool Running::take_line(std::string& line) {
 }
 
 void Running::signal_again() {
-  if (MonoClock::now() >= signal_again_) signal(ending_ == SIGINT ? SIGTERM : SIGINT);
+  if (MonoClock::now() >= signal_again_) signal(other_signal(ending_));
 }
 
 void Running::read_some(int timeout_ms) {
@@ -109,10 +132,7 @@ void Running::stop() {
 }
 
 int Running::status() {
-  siginfo_t end{};
-  while (kLosesSignals && ending_ != 0 &&
-         ::waitid(P_PID, static_cast<id_t>(pid_), &end, WEXITED | WNOHANG | WNOWAIT) == 0 &&
-         end.si_pid == 0) {
+  while (kLosesSignals && ending_ != 0 && runs(pid_)) {
     signal_again();
     std::this_thread::sleep_for(kPollPause);
   }

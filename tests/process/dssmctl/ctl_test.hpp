@@ -11,6 +11,7 @@
 #include <nlohmann/json.hpp>
 #include <string>
 #include <string_view>
+#include <thread>
 #include <vector>
 
 #include "tests/support/await.hpp"
@@ -71,6 +72,16 @@ class Running {
   int ending_ = 0;  // the signal that it was sent last to end it
   MonoTime signal_again_;
   std::string text_;
+};
+
+// Sends a signal that is to end a program of this process, and if ThreadSanitizer loses it, another
+// one, until the end of this object.
+class EndingSignal {
+ public:
+  EndingSignal(pid_t pid, int number);
+
+ private:
+  std::jthread again_;
 };
 
 // This process's session with a dssmd.

@@ -105,7 +105,7 @@ TEST_F(Plot, DrawsOnATerminal) {
     shown.append(buffer, static_cast<std::size_t>(got));
     if (shown.size() > 100'000) FAIL() << shown;
   }
-  ::kill(pid, SIGINT);
+  const EndingSignal sent(pid, SIGINT);
   EXPECT_EQ(wait_for(pid), 0);
   ::close(terminal);
 }

@@ -373,7 +373,7 @@ TEST_F(TopOnATerminal, RestoresTheTerminalWhenASignalEndsIt) {
   for (const int number : {SIGINT, SIGTERM, SIGHUP}) {
     top();
     EXPECT_TRUE(screen_.is_alternate);
-    ::kill(pid_, number);
+    const EndingSignal sent(pid_, number);
     EXPECT_EQ(end(), 0) << number;
     expect_restored();
     ::close(std::exchange(terminal_, -1));
