@@ -197,8 +197,10 @@ void TriggerEvaluator::on_lists(const std::vector<StreamInfo>& streams,
       known = {stream.id, stream.incarnation, stream.crashed_writers, false};
     }
     for (const TriggerRule& rule : rules_) check_stream(rule, stream, known, now);
-    // Of a host that does not answer just now, the list has an earlier number.
-    known.crashed_writers = std::max(known.crashed_writers, stream.crashed_writers);
+    // Of a host that does not answer just now, the list has an earlier number. (A lower one counts
+    // otherwise: its dssmd was restarted.)
+    const bool is_earlier = stream.state == StreamState::unknown && stream.newest == kNoTid;
+    if (!is_earlier) known.crashed_writers = stream.crashed_writers;
     known.live = stream.state == StreamState::live || (known.live && !is_silent(stream));
   }
   // A host that is lost takes its streams from the list.

@@ -145,6 +145,7 @@ TEST_F(BlackBox, TellsRequestsThatWereBeforeItByTheirNumbersNotTheirTimes) {
   requests.write(request, WallClock::now() + 1h);
   Running running(recorder({"--after", "1ms"}), environment());
   await_armed(power.id());
+  request = {};
   ctl::set_text(request.name, "behind");
   requests.write(request, WallClock::now() - 1h);
   const std::string line = running.line();

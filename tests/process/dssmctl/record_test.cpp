@@ -172,8 +172,8 @@ TEST_F(Record, OfThePastTakesWhatTheRingsHoldOfThatTimeAndEnds) {
   auto pose = session_.create<RecordedPose>("pose", depth_of(256)).value();
   const Time now = WallClock::now();
   // Half a minute may pass until dssmctl begins.
-  for (int i = 0; i < 100; ++i) pose.write({0, 0, i}, now - 100min + i * 1min);
-  const std::string text = output({"record", "--past", "1830s", "-o", file_});
+  for (int i = 0; i < 100; ++i) pose.write({0, 0, i}, now - (99 - i) * 1min);
+  const std::string text = output({"record", "--past", "1770s", "-o", file_});
   RecordedReader<RecordedPose> reader = recorded(file_, "pose");
   for (int i = 70; i < 100; ++i) {
     const auto sample = reader.read_next();

@@ -208,6 +208,8 @@ TEST(TriggerEvaluator, FiresForEachWriterThatCrashesAndNotForThoseOfBefore) {
   EXPECT_EQ(fired[0].reason, "driver (pid 12) ended without closing 'a:0@pc1'");
   EXPECT_TRUE(
       lists.show({stream("a", StreamState::live, 4), stream("b", StreamState::live, 1)}).empty());
+  EXPECT_TRUE(lists.show({stream("a", StreamState::unknown, 2)}).empty()) << "no answer in time";
+  EXPECT_TRUE(lists.show({stream("a", StreamState::live, 4)}).empty());
   EXPECT_TRUE(lists.show({stream("a", StreamState::live, 0)}).empty()) << "dssmd was restarted";
   EXPECT_EQ(lists.show({stream("a", StreamState::live, 1)}).size(), 1U);
   EXPECT_TRUE(lists.show({stream("a", StreamState::live, 2, 2)}).empty()) << "another ring";
