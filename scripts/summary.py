@@ -27,7 +27,7 @@ def first_lines(text: str | None) -> str:
 
 
 def beginning_and_end(printed: str) -> str:
-    """Of the output of a program that failed without naming a failed test."""
+    """The first and the last lines of a program's output, if it is long."""
     lines = printed.strip().splitlines()
     if len(lines) > 2 * MAX_LINES:
         lines[MAX_LINES:-MAX_LINES] = ["..."]
