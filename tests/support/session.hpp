@@ -6,7 +6,9 @@
 #include <chrono>
 #include <dssm/dssm.hpp>
 #include <string>
+#include <thread>
 
+#include "tests/support/await.hpp"
 #include "tests/support/daemon_process.hpp"
 
 namespace dssm::test {
@@ -19,6 +21,16 @@ inline constexpr History kLong{1 << 16, std::chrono::milliseconds(1)};
 inline Session connect_to(const std::string& socket_path) {
   return Session::connect({.socket_path = socket_path, .request_timeout = std::chrono::seconds(60)})
       .value();
+}
+
+// Waits for a request 200 ms at most. Tries again: a busy dssmd may be late with its greeting.
+inline Session connect_impatiently(const std::string& socket_path) {
+  for (;;) {
+    auto session = Session::connect(
+        {.socket_path = socket_path, .request_timeout = std::chrono::milliseconds(200)});
+    if (session) return *std::move(session);
+    std::this_thread::sleep_for(kPollPause);
+  }
 }
 
 inline Session connect(const DaemonProcess& daemon) { return connect_to(daemon.socket_path()); }

@@ -217,19 +217,13 @@ TEST(LateAnswer, LeavesNoOpenStream) {
   const Writer<double> writer = writing.create<double>("late", History{16, 1ms}).value();
   const auto readers = [&] { return writing.stream_info({"late", 0, ""}).value().readers; };
   test::Relay relay(daemon.socket_path());
-  std::optional<Session> impatient;
-  await([&] {  // a busy dssmd may be late with its greeting
-    auto connected =
-        Session::connect({.socket_path = relay.socket_path(), .request_timeout = 200ms});
-    if (connected) impatient = std::move(*connected);
-    return impatient.has_value();
-  });
+  Session impatient = test::connect_impatiently(relay.socket_path());
   std::promise<void> release;
   relay.set_behind([answer = release.get_future().share()](const local::Response& response) {
     if (response.has_opened()) answer.wait();
     return std::string();
   });
-  EXPECT_FALSE(impatient->open_reader<double>("late"));
+  EXPECT_FALSE(impatient.open_reader<double>("late"));
   await([&] { return readers() == 1; });
   release.set_value();
   await([&] { return readers() == 0; });

@@ -153,17 +153,11 @@ TEST(Restart, NotifiesWatchersOfRemovedStreams) {
 TEST(Restart, NotifiesAWatchThatWasMadeWhileAnotherOneWaited) {
   DaemonProcess daemon;
   Session other = connect(daemon);
-  std::optional<Session> impatient;
-  await([&] {
-    auto connected =
-        Session::connect({.socket_path = daemon.socket_path(), .request_timeout = 200ms});
-    if (connected) impatient = std::move(*connected);
-    return impatient.has_value();
-  });
+  Session impatient = test::connect_impatiently(daemon.socket_path());
   daemon.kill_hard();
   std::atomic<bool> heard{false};
   const auto watch = [&] {
-    return impatient->watch([&](const StreamEvent& event) {
+    return impatient.watch([&](const StreamEvent& event) {
       if (event.stream.id.name == "marker") heard = true;
     });
   };
@@ -211,15 +205,9 @@ TEST(Restart, FailsRequestsWithAReasonWhileTheDaemonIsDown) {
   DaemonProcess daemon;
   Session session = connect(daemon);
   Writer<Numbered> writer = session.create<Numbered>("s", History{16, 1ms}).value();
-  std::optional<Session> impatient;
-  await([&] {  // a busy dssmd may be late with its greeting
-    auto connected =
-        Session::connect({.socket_path = daemon.socket_path(), .request_timeout = 50ms});
-    if (connected) impatient = std::move(*connected);
-    return impatient.has_value();
-  });
+  Session impatient = test::connect_impatiently(daemon.socket_path());
   daemon.kill_hard();
-  const auto list = impatient->list_streams();
+  const auto list = impatient.list_streams();
   ASSERT_FALSE(list);
   EXPECT_EQ(list.error().code, Errc::unavailable);
   EXPECT_NE(list.error().message.find("list the streams"), std::string::npos);

@@ -525,17 +525,19 @@ TEST_F(View, ByTlsServesOnlyClientsOfItsAuthority) {
   const std::string line = secure.line();
   ASSERT_TRUE(contains(line, "https://127.0.0.1:")) << line;
   const std::string address = line.substr(line.find("127."), line.size() - 1 - line.find("127."));
+  // Beginning of a Python program with the arguments address, authority, folder of a certificate.
+  const std::string tls =
+      "import asyncio, http.client, ssl, sys, time, websockets\n"
+      "address, authority, own = sys.argv[1:]\n"
+      "context = ssl.create_default_context(cafile=authority)\n"
+      "context.check_hostname = False\n"
+      "if own: context.load_cert_chain(own + '/own.crt', own + '/own.key')\n";
   // Of a GET with the certificate in that folder; empty: with none.
   const auto get = [&](const std::string& certificate) {
     return run({"/usr/bin/python3", "-c",
-                "import http.client, ssl, sys\n"
-                "address, authority, own = sys.argv[1:]\n"
-                "context = ssl.create_default_context(cafile=authority)\n"
-                "context.check_hostname = False\n"
-                "if own: context.load_cert_chain(own + '/own.crt', own + '/own.key')\n"
-                "client = http.client.HTTPSConnection(address, context=context)\n"
-                "client.request('GET', '/metrics')\n"
-                "print(client.getresponse().status, client.sock.version())\n",
+                tls + "client = http.client.HTTPSConnection(address, context=context)\n"
+                      "client.request('GET', '/metrics')\n"
+                      "print(client.getresponse().status, client.sock.version())\n",
                 address, own + "/ca.crt", certificate})
         .out;
   };
@@ -546,39 +548,29 @@ TEST_F(View, ByTlsServesOnlyClientsOfItsAuthority) {
   EXPECT_EQ(get(laptop), "200 TLSv1.3\n");
   // Asks again and again by one connection, until that is ended.
   Running staying({"/usr/bin/python3", "-c",
-                   "import http.client, ssl, sys, time\n"
-                   "address, authority, own = sys.argv[1:]\n"
-                   "context = ssl.create_default_context(cafile=authority)\n"
-                   "context.check_hostname = False\n"
-                   "context.load_cert_chain(own + '/own.crt', own + '/own.key')\n"
-                   "client = http.client.HTTPSConnection(address, context=context)\n"
-                   "client.connect()\n"
-                   "client.auto_open = False\n"
-                   "status, count = 200, 0\n"
-                   "while status == 200:\n"
-                   "  client.request('GET', '/time.js')\n"
-                   "  answer = client.getresponse()\n"
-                   "  answer.read()\n"
-                   "  status, count = answer.status, count + 1\n"
-                   "  if count == 2: print('stays', flush=True)\n"
-                   "  time.sleep(0.1)\n"
-                   "print('ended by', status, flush=True)\n",
+                   tls + "client = http.client.HTTPSConnection(address, context=context)\n"
+                         "client.connect()\n"
+                         "client.auto_open = False\n"
+                         "status, count = 200, 0\n"
+                         "while status == 200:\n"
+                         "  client.request('GET', '/time.js')\n"
+                         "  answer = client.getresponse()\n"
+                         "  answer.read()\n"
+                         "  status, count = answer.status, count + 1\n"
+                         "  if count == 2: print('stays', flush=True)\n"
+                         "  time.sleep(0.1)\n"
+                         "print('ended by', status, flush=True)\n",
                    address, own + "/ca.crt", laptop},
                   {});
   EXPECT_EQ(staying.line(), "stays");
   Running page({"/usr/bin/python3", "-c",
-                "import asyncio, ssl, sys, websockets\n"
-                "address, authority, own = sys.argv[1:]\n"
-                "context = ssl.create_default_context(cafile=authority)\n"
-                "context.check_hostname = False\n"
-                "context.load_cert_chain(own + '/own.crt', own + '/own.key')\n"
-                "async def main():\n"
-                "  async with websockets.connect('wss://' + address, ssl=context,\n"
-                "      subprotocols=['dssm.view.v1']) as server:\n"
-                "    print('open', flush=True)\n"
-                "    await server.wait_closed()\n"
-                "    print('closed,', server.close_reason, flush=True)\n"
-                "asyncio.run(main())\n",
+                tls + "async def main():\n"
+                      "  async with websockets.connect('wss://' + address, ssl=context,\n"
+                      "      subprotocols=['dssm.view.v1']) as server:\n"
+                      "    print('open', flush=True)\n"
+                      "    await server.wait_closed()\n"
+                      "    print('closed,', server.close_reason, flush=True)\n"
+                      "asyncio.run(main())\n",
                 address, own + "/ca.crt", laptop},
                {});
   EXPECT_EQ(page.line(), "open");

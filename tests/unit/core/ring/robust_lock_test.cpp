@@ -96,7 +96,7 @@ TEST(RobustLock, CountsNoTimeInWhichTheProcessStandsStill) {
 #ifdef __SANITIZE_THREAD__
   GTEST_SKIP() << "ThreadSanitizer does not know threads of a forked process";
 #endif
-  if (!knows_robust_lists()) GTEST_SKIP() << "qemu-user, whose threads stop otherwise";
+  if (!knows_robust_lists()) GTEST_SKIP() << "not tried under qemu-user";
   const LockFile file;
   int waits[2], go[2];
   ASSERT_EQ(::pipe(waits), 0);
@@ -118,7 +118,7 @@ TEST(RobustLock, CountsNoTimeInWhichTheProcessStandsStill) {
   ASSERT_EQ(::kill(child, SIGSTOP), 0);
   std::this_thread::sleep_for(RobustLock::kMaxWait + std::chrono::milliseconds(100));
   ASSERT_EQ(::kill(child, SIGCONT), 0);
-  // What it would give up in.
+  // Time in which the thread would give up, if it counted that in which it stood still.
   std::this_thread::sleep_for(std::chrono::milliseconds(100));
   ASSERT_EQ(::write(go[1], &byte, 1), 1);
   int status = 0;
