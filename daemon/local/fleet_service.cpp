@@ -315,12 +315,17 @@ std::vector<const KnownHost*> FleetService::hosts_by_name() const {
   return hosts;
 }
 
-std::vector<StreamInfo> FleetService::known_streams() const {
-  std::vector<StreamInfo> streams;
-  for (const KnownHost* host : hosts_by_name()) {
-    for (const auto& [key, stream] : host->streams) streams.push_back(stream);
+const StreamInfo* FleetService::next_stream(const StreamId& id) const {
+  const auto place = [](const StreamId& of) { return std::tie(of.host, of.name, of.id); };
+  const StreamInfo* next = nullptr;
+  for (const auto& [host_id, host] : catalog_.hosts()) {
+    if (host.greeting.host < id.host) continue;
+    const auto stream = host.greeting.host == id.host ? host.streams.upper_bound({id.name, id.id})
+                                                      : host.streams.begin();
+    if (stream == host.streams.end()) continue;
+    if (!next || place(stream->second.id) < place(next->id)) next = &stream->second;
   }
-  return streams;
+  return next;
 }
 
 // Calls `then` when all have answered, or at the timeout.

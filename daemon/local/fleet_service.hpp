@@ -71,7 +71,7 @@ class FleetService final : public Fleet, private CatalogObserver {
   void list_nodes(NodeTable nodes, std::function<void(NodeTable)> then) override;
   void follow_playback(const proto::FollowPlayback& request,
                        Then<proto::PlaybackFollowers> then) override;
-  std::vector<StreamInfo> known_streams() const override;
+  const StreamInfo* next_stream(const StreamId& id) const override;
   std::vector<local::Host> hosts() const override;
   void describe(local::Daemon& daemon) const override;
   local::Mdns mdns() const;

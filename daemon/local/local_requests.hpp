@@ -99,8 +99,9 @@ class Fleet {
   // What the hosts that are up report of the processes that have streams open, added to `nodes`; of
   // one that does not answer within kFreshTimeout, or fails, the error.
   virtual void list_nodes(NodeTable nodes, std::function<void(NodeTable)> then) = 0;
-  // What is in the catalog now, without a request to other hosts: for Watch.
-  virtual std::vector<StreamInfo> known_streams() const = 0;
+  // Of what is in the catalog now, the first stream after `id` in the order of hosts' names, names
+  // and ids; nullptr: none. Valid until the catalog changes.
+  virtual const StreamInfo* next_stream(const StreamId& id) const = 0;
 
   // Has all other hosts' playback clocks follow as `request` says, and waits kFreshTimeout for
   // their answers.

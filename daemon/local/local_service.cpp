@@ -239,35 +239,69 @@ void LocalService::log_offer(const ClientIdentity& client, const local::Offer& o
 }
 
 // First the existing streams, then the response: after a reconnect it shows the client that streams
-// which were not among them do not exist any more. All at once, unlike StreamWatch of other hosts:
-// the output of a program is bounded by kMaxQueuedBytes.
+// which were not among them do not exist any more. Changes are sent at once, also those of streams
+// that have not been told: a receiver ignores what it knows.
 void LocalService::watch(ClientNumber number, std::uint64_t serial) {
-  std::vector<proto::StreamEvent> events = added_events();
-  std::erase_if(
-      events, [&](const proto::StreamEvent& event) { return !shows(clients_.at(number), event); });
-  if (!send_events(number, events)) return;
   Client& client = clients_.at(number);
-  client.watching = true;
-  Reply done;
-  done.response.mutable_done();
-  send(client, serial, std::move(done));
+  Watch begun;
+  if (client.watch) begun.serials = std::move(client.watch->serials);
+  begun.serials.push_back(serial);
+  client.watch = std::move(begun);
+  if (tell_streams(number)) client.output->request_turn();
 }
 
-std::vector<proto::StreamEvent> LocalService::added_events() const {
+bool LocalService::tell_streams(ClientNumber number) {
+  Client& client = clients_.at(number);
+  if (!client.watch || !client.watch->is_telling) return false;
+  const std::vector<proto::StreamEvent> events = next_events(client);
+  const bool is_telling = client.watch->is_telling;
+  std::vector<std::uint64_t> serials;
+  if (!is_telling) serials.swap(client.watch->serials);
+  if (!send_events(number, events)) return false;
+  for (const std::uint64_t serial : serials) {
+    Reply done;
+    done.response.mutable_done();
+    on_answer(number, serial, std::move(done));
+  }
+  return is_telling;
+}
+
+// The next part of the streams that exist; is_telling is false after the last one.
+std::vector<proto::StreamEvent> LocalService::next_events(Client& client) const {
+  Watch& watch = *client.watch;
   std::vector<proto::StreamEvent> events;
-  for (const std::shared_ptr<Stream>& stream : registry_.streams()) {
-    events.push_back(added_event(*stream, opens_));
+  std::size_t bytes = 0;
+  int seen = 0;
+  const auto is_full = [&] { return seen == kStreamsPerTurn || bytes >= kStreamBytesPerTurn; };
+  const auto add = [&](proto::StreamEvent event) {
+    bytes += event.ByteSizeLong();
+    events.push_back(std::move(event));
+  };
+  const std::vector<std::shared_ptr<Stream>>& own = registry_.streams();
+  auto next = std::upper_bound(own.begin(), own.end(), watch.own,
+                               [](std::uint64_t order, const std::shared_ptr<Stream>& stream) {
+                                 return order < stream->created_order();
+                               });
+  for (; next != own.end(); ++next, ++seen) {
+    if (is_full()) return events;
+    watch.own = (*next)->created_order();
+    if (shows(client, (*next)->id())) add(added_event(**next, opens_));
   }
-  if (fleet_) {
-    for (const StreamInfo& stream : fleet_->known_streams()) {
-      wire::to_message(stream, *events.emplace_back().mutable_stream());
-    }
+  const auto next_other = [&] { return fleet_ ? fleet_->next_stream(watch.others) : nullptr; };
+  for (; const StreamInfo* stream = next_other(); ++seen) {
+    if (is_full()) return events;
+    watch.others = stream->id;
+    if (!shows(client, stream->id)) continue;
+    proto::StreamEvent event;
+    wire::to_message(*stream, *event.mutable_stream());
+    add(std::move(event));
   }
+  watch.is_telling = false;
   return events;
 }
 
-bool LocalService::shows(const Client& client, const proto::StreamEvent& event) const {
-  return rights_.shows(*client.identity, id_of(event));
+bool LocalService::shows(const Client& client, const StreamId& id) const {
+  return rights_.shows(*client.identity, id);
 }
 
 // False when the client is disconnected by then.
@@ -304,18 +338,24 @@ void LocalService::send_failure(const Client& client, std::uint64_t serial, cons
   client.output->send(wire::encode_frame(failure_response(serial, error)), {});
 }
 
-void LocalService::broadcast(const proto::StreamEvent& event) {
-  std::vector<ClientNumber> watchers;  // sending may end connections
+// A copy: sending may end connections.
+std::vector<ClientNumber> LocalService::watchers() const {
+  std::vector<ClientNumber> watchers;
   for (const auto& [number, client] : clients_) {
-    if (client.watching) watchers.push_back(number);
+    if (client.watch) watchers.push_back(number);
   }
+  return watchers;
+}
+
+void LocalService::broadcast(const proto::StreamEvent& event) {
+  const std::vector<ClientNumber> watchers = this->watchers();
   if (watchers.empty()) return;
   local::Response response;
   *response.mutable_stream_event() = event;
   const std::string frame = wire::encode_frame(response);
   for (const ClientNumber number : watchers) {
     const auto client = clients_.find(number);
-    if (client != clients_.end() && shows(client->second, event)) {
+    if (client != clients_.end() && shows(client->second, id_of(event))) {
       client->second.output->send(frame, {});
     }
   }
@@ -415,21 +455,38 @@ void LocalService::on_new_rights(const Rights& before) {
     if (open.role == Role::reader) notify_replaced({open.client->number, number, open.any_host});
     static_cast<void>(opens_.remove(open.client->number, number));  // sending may have ended it
   }
-  std::vector<ClientNumber> watchers;  // sending may end connections
-  for (const auto& [number, client] : clients_) {
-    if (client.watching) watchers.push_back(number);
+  for (const ClientNumber number : watchers()) {
+    if (clients_.contains(number)) update_watch(number, before);
   }
-  const std::vector<proto::StreamEvent> events = added_events();
-  for (const ClientNumber number : watchers) {
-    std::vector<proto::StreamEvent> changes;
-    for (const proto::StreamEvent& event : events) {
-      const StreamId id = id_of(event);
-      const bool is_shown = shows(clients_.at(number), event);
-      if (is_shown == before.shows(*clients_.at(number).identity, id)) continue;
-      changes.push_back(is_shown ? event : removed_event(id, event.stream().incarnation()));
+}
+
+// What the client may not see any more is gone for it; if it may see others, it is told all again.
+void LocalService::update_watch(ClientNumber number, const Rights& before) {
+  Client& client = clients_.at(number);
+  bool sees_others = false;
+  std::vector<proto::StreamEvent> hidden;
+  const auto compare = [&](const StreamId& id, std::uint64_t incarnation) {
+    const bool is_shown = shows(client, id);
+    if (is_shown == before.shows(*client.identity, id)) return;
+    sees_others |= is_shown;
+    if (!is_shown) hidden.push_back(removed_event(id, incarnation));
+  };
+  for (const std::shared_ptr<Stream>& stream : registry_.streams()) {
+    compare(stream->id(), stream->incarnation());
+  }
+  if (fleet_) {
+    for (const StreamInfo* stream = fleet_->next_stream({}); stream;
+         stream = fleet_->next_stream(stream->id)) {
+      compare(stream->id, stream->incarnation);
     }
-    send_events(number, changes);
   }
+  if (sees_others) {
+    client.watch->is_telling = true;
+    client.watch->own = 0;
+    client.watch->others = {};
+    client.output->request_turn();
+  }
+  send_events(number, hidden);
 }
 
 // --- recovery

@@ -44,6 +44,8 @@ namespace dssm::daemon {
 class ClientOutput {
  public:
   virtual void send(std::string bytes, std::vector<UniqueFd> descriptors) = 0;
+  // Has LocalService::tell_streams() called, from the loop.
+  virtual void request_turn() = 0;
 
  protected:
   ~ClientOutput() = default;
@@ -55,6 +57,10 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   static constexpr std::size_t kMaxAwaited = 1024;
   // What one client may have deferred during recovery.
   static constexpr std::size_t kMaxDeferredBytes = 1U << 20;
+  // Events of existing streams for one that watches, before others get their turn: so many, or as
+  // many as begin within these bytes.
+  static constexpr int kStreamsPerTurn = 64;
+  static constexpr std::size_t kStreamBytesPerTurn = 64U << 10;
 
   // fleet: outlives this; nullptr: there are no other hosts.
   LocalService(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock,
@@ -83,17 +89,31 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   bool on_frame_untrusted(ClientNumber number, std::span<const std::byte> frame,
                           DescriptorQueue& descriptors);
 
+  // Sends some events of existing streams, if the client watches and has not got all of them. Call
+  // it as fast as the client receives, and before its further requests.
+  //   returns  whether there are more
+  bool tell_streams(ClientNumber number);
+
   // The rights have changed: ends opens that are not allowed any more. Their readers reopen, and
   // get the failure that says why they may not. Mirrors and remote writers end that no other
   // program has open. Watches show what they may see now.
   void on_new_rights(const Rights& before);
 
  private:
+  // How far a client that watches has been told of the streams that exist: first this PC's own ones
+  // in the order of creation, then those of other hosts. A place, not a list, so that many clients
+  // that do not read need no memory for it.
+  struct Watch {
+    bool is_telling = true;
+    std::vector<std::uint64_t> serials;  // of Watch requests that are answered at the end
+    std::uint64_t own = 0;               // created_order() of the last one
+    StreamId others;                     // the last one
+  };
   struct Client {
     std::shared_ptr<const ClientIdentity> identity;
     ClientOutput* output = nullptr;
     bool greeted = false;
-    bool watching = false;
+    std::optional<Watch> watch;
     std::size_t deferred_bytes = 0;
     std::size_t awaited = 0;  // answers of other hosts
   };
@@ -118,9 +138,11 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   void send(const Client& client, std::uint64_t serial, Reply reply);
   void send_failure(const Client& client, std::uint64_t serial, const Error& error);
   void broadcast(const proto::StreamEvent& event);
-  std::vector<proto::StreamEvent> added_events() const;
-  bool shows(const Client& client, const proto::StreamEvent& event) const;
+  std::vector<ClientNumber> watchers() const;
+  bool shows(const Client& client, const StreamId& id) const;
+  std::vector<proto::StreamEvent> next_events(Client& client) const;
   bool send_events(ClientNumber number, const std::vector<proto::StreamEvent>& events);
+  void update_watch(ClientNumber number, const Rights& before);
 
   bool must_wait(const local::Request& request) const;
   void defer(Client& client, const local::Request& request, std::size_t bytes);

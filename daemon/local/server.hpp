@@ -129,6 +129,7 @@ class Connection final : public ClientOutput {
   ~Connection();
 
   void send(std::string bytes, std::vector<UniqueFd> descriptors) override;
+  void request_turn() override { next_turn_.enable_in(Duration::zero()); }
 
  private:
   struct Outgoing {

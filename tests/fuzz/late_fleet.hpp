@@ -61,8 +61,8 @@ class LateFleet final : public Fleet {
   void list(Then<std::vector<proto::Stream>> then) override {
     due_.push_back([this, then = std::move(then)] {
       std::vector<proto::Stream> streams;
-      for (const StreamInfo& stream : known_streams()) {
-        wire::to_message(stream, streams.emplace_back());
+      for (const auto& stream : pc2_.streams()) {
+        wire::to_message(stream->info(), streams.emplace_back());
       }
       then(std::move(streams));
     });
@@ -76,10 +76,17 @@ class LateFleet final : public Fleet {
   void follow_playback(const proto::FollowPlayback&, Then<proto::PlaybackFollowers> then) override {
     due_.push_back([then = std::move(then)] { then(proto::PlaybackFollowers()); });
   }
-  std::vector<StreamInfo> known_streams() const override {
-    std::vector<StreamInfo> streams;
-    for (const auto& stream : pc2_.streams()) streams.push_back(stream->info());
-    return streams;
+  const StreamInfo* next_stream(const StreamId& id) const override {
+    const Stream* next = nullptr;
+    const auto key = [](const StreamId& of) { return std::pair(of.name, of.id); };
+    for (const auto& stream : pc2_.streams()) {
+      const StreamId& there = stream->id();
+      if (id.host == there.host && key(there) <= key(id)) continue;
+      if (!next || key(there) < key(next->id())) next = stream.get();
+    }
+    if (!next) return nullptr;
+    next_ = next->info();
+    return &next_;
   }
   std::vector<local::Host> hosts() const override { return std::vector<local::Host>(2); }
   void describe(local::Daemon&) const override {}
@@ -109,6 +116,7 @@ class LateFleet final : public Fleet {
   }
 
   Registry pc2_{"pc2", {.max_streams = 8, .max_memory_bytes = 1 << 20, .max_property_bytes = 16}};
+  mutable StreamInfo next_;  // what next_stream() returned
   Observer* observer_ = nullptr;
   std::vector<std::function<void()>> due_;
 };

@@ -56,6 +56,10 @@ class FakeClient final : public ClientOutput {
     received_descriptors.push_back(std::move(descriptors));
   }
 
+  void request_turn() override { ++turns; }
+  // Its next turn; false: it needs no other one.
+  bool take_turn() { return service_.tell_streams(number_); }
+
   bool put(const local::Request& request) {
     const std::string bytes = request.SerializeAsString();
     return service_.on_frame_untrusted(number_, std::as_bytes(std::span(bytes)), offered);
@@ -93,6 +97,7 @@ class FakeClient final : public ClientOutput {
   std::deque<std::vector<UniqueFd>> received_descriptors;
   std::vector<UniqueFd> last_descriptors;
   DescriptorQueue offered;
+  int turns = 0;  // requested
 
  private:
   static Identity program_of(std::int32_t pid) {

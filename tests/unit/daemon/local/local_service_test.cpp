@@ -219,6 +219,77 @@ TEST(LocalService, NotifiesWatchersOfExistingStreamsAndOfChanges) {
   EXPECT_TRUE(client.received.empty()) << "who does not watch hears nothing";
 }
 
+TEST(LocalService, TellsManyStreamsInParts) {
+  constexpr int kStreams = 2 * LocalService::kStreamsPerTurn + 1;
+  LocalDaemon daemon;
+  FakeClient client(daemon.service, 5), watcher(daemon.service, 6);
+  client.greet(), watcher.greet();
+  const auto name = [](int number) { return "s" + std::to_string(number); };
+  for (int i = 0; i < kStreams; ++i) {
+    ASSERT_TRUE(daemon.registry.create({name(i), 0, ""}, odometry_type(), kHistory, 1));
+  }
+  local::Request watch;
+  watch.set_serial(2);
+  watch.mutable_watch();
+  ASSERT_TRUE(watcher.put(watch));
+  ASSERT_EQ(watcher.received.size(), std::size_t{LocalService::kStreamsPerTurn});
+  EXPECT_EQ(watcher.turns, 1);
+  for (int i = 0; i < LocalService::kStreamsPerTurn; ++i) {
+    EXPECT_EQ(watcher.next().stream_event().stream().id().name(), name(i));
+  }
+
+  // Changes come at once: of a stream that has been told, of one that has not, and of a new one.
+  local::Request remove;
+  for (const int gone : {0, kStreams - 1}) {
+    remove.mutable_remove()->mutable_id()->set_name(name(gone));
+    client.ask(remove);
+    const local::Response removed = watcher.next();
+    EXPECT_TRUE(removed.stream_event().removed());
+    EXPECT_EQ(removed.stream_event().stream().id().name(), name(gone));
+  }
+  client.ask(create_request("new"));
+  EXPECT_EQ(watcher.next().stream_event().stream().id().name(), "new");
+
+  ASSERT_TRUE(watcher.take_turn());
+  EXPECT_EQ(watcher.received.size(), std::size_t{LocalService::kStreamsPerTurn});
+  EXPECT_FALSE(watcher.take_turn());
+  for (int i = LocalService::kStreamsPerTurn; i < kStreams - 1; ++i) {
+    EXPECT_EQ(watcher.next().stream_event().stream().id().name(), name(i));
+  }
+  EXPECT_EQ(watcher.next().stream_event().stream().id().name(), "new");
+  EXPECT_EQ(watcher.next().serial(), 2u) << "the answer, when all has been told";
+  EXPECT_TRUE(watcher.received.empty());
+  EXPECT_FALSE(watcher.take_turn());
+  EXPECT_EQ(watcher.turns, 1);
+}
+
+TEST(LocalService, TellsFewStreamsAtOnceWhenTheyAreLong) {
+  LocalDaemon daemon;
+  FakeClient client(daemon.service, 5), watcher(daemon.service, 6);
+  client.greet(), watcher.greet();
+  for (int i = 0; i < 20; ++i) {
+    local::Request create = create_request("s" + std::to_string(i));
+    proto::Type& type = *create.mutable_create()->mutable_type();
+    const proto::Field field = type.fields(0);
+    for (int more = 0; more < 500; ++more) {
+      *type.add_fields() = field;
+      type.mutable_fields(type.fields_size() - 1)->set_name("f" + std::to_string(more));
+    }
+    ASSERT_TRUE(client.ask(create).has_opened());
+  }
+  local::Request watch;
+  watch.set_serial(2);
+  watch.mutable_watch();
+  ASSERT_TRUE(watcher.put(watch));
+  std::size_t bytes = 0;
+  for (const local::Response& event : watcher.received) bytes += event.ByteSizeLong();
+  EXPECT_GT(bytes, LocalService::kStreamBytesPerTurn);
+  EXPECT_LT(bytes, LocalService::kStreamBytesPerTurn * 2);
+  while (watcher.take_turn()) {
+  }
+  EXPECT_EQ(watcher.received.size(), 21u);
+}
+
 TEST(LocalService, ListsProgramsInTheOrderTheyCame) {
   LocalDaemon daemon;
   FakeClient one(daemon.service, 11), two(daemon.service, 12), silent(daemon.service, 13);

@@ -4,7 +4,9 @@
 // go there, what comes back, who is told of changes, and what happens to those who do not wait.
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <set>
+#include <tuple>
 
 #include "daemon/local/local_requests.hpp"
 #include "tests/unit/daemon/local/fake_client.hpp"
@@ -85,7 +87,13 @@ class FakeFleet final : public Fleet {
     nodes.add({12, 1000, "mapper", Role::reader, StreamVia::local, "pc2"}, {"lidar", 0, "pc2"});
     then(std::move(nodes));
   }
-  std::vector<StreamInfo> known_streams() const override { return known; }
+  const StreamInfo* next_stream(const StreamId& id) const override {
+    const auto place = [](const StreamId& of) { return std::tie(of.host, of.name, of.id); };
+    const auto next = std::find_if(known.begin(), known.end(), [&](const StreamInfo& stream) {
+      return place(id) < place(stream.id);
+    });
+    return next == known.end() ? nullptr : &*next;
+  }
   std::vector<local::Host> hosts() const override {
     std::vector<local::Host> hosts(2);
     hosts[0].set_name("pc1");
@@ -114,7 +122,7 @@ class FakeFleet final : public Fleet {
   Then<std::shared_ptr<Stream>> reader_then;
   Then<OpenedRing> writer_then;
   std::vector<Then<std::vector<proto::Stream>>> list_then;
-  std::vector<StreamInfo> known;
+  std::vector<StreamInfo> known;  // in the order of hosts, names and ids
   std::vector<ClockPair> pairs;
   std::set<std::string> there;
 };

@@ -23,20 +23,19 @@ class ServerTest : public testing::Test, protected LocalDaemon {
   ServerTest() : LocalDaemon(false, {100, 100}) {}
   ~ServerTest() override { std::filesystem::remove_all(dir); }
 
-  // A program that has asked for a long property.
-  UniqueFd connect() {
+  // A program that has sent Hello and `request`.
+  UniqueFd connect(local::Request request) {
     sockaddr_un address{};
     address.sun_family = AF_UNIX;
     std::strncpy(address.sun_path, path.c_str(), sizeof address.sun_path - 1);
     UniqueFd program(::socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0));
     EXPECT_EQ(::connect(program.get(), reinterpret_cast<const sockaddr*>(&address), sizeof address),
               0);
-    local::Request hello, get;
+    local::Request hello;
     hello.set_serial(1);
     hello.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);
-    get.set_serial(2);
-    get.mutable_get_property()->mutable_id()->set_name("map");
-    const std::string bytes = wire::encode_frame(hello) + wire::encode_frame(get);
+    request.set_serial(2);
+    const std::string bytes = wire::encode_frame(hello) + wire::encode_frame(request);
     EXPECT_EQ(::send(program.get(), bytes.data(), bytes.size(), 0), std::ssize(bytes));
     run_turns(loop, 20);
     return program;
@@ -69,7 +68,9 @@ class ServerTest : public testing::Test, protected LocalDaemon {
 TEST_F(ServerTest, DisconnectsAProgramThatDoesNotRead) {
   registry.create({"map", 0, ""}, odometry_type(), kHistory, 1).value();
   ASSERT_TRUE(registry.set_property({"map", 0, ""}, std::string(1 << 20, 'p')));
-  const UniqueFd silent = connect(), slow = connect(), quick = connect();
+  local::Request get;
+  get.mutable_get_property()->mutable_id()->set_name("map");
+  const UniqueFd silent = connect(get), slow = connect(get), quick = connect(get);
   ASSERT_FALSE(is_closed(quick));
   run_turns(loop, 20);
   ASSERT_FALSE(is_closed(quick));
@@ -82,6 +83,41 @@ TEST_F(ServerTest, DisconnectsAProgramThatDoesNotRead) {
   EXPECT_TRUE(logger.contains("a program has read nothing for 10 s of the "));
   pass(Duration(1));
   EXPECT_FALSE(is_closed(slow));
+}
+
+TEST_F(ServerTest, TellsManyStreamsAsFastAsAProgramReads) {
+  constexpr int kStreams = 300;
+  TypeInfo type = odometry_type();
+  for (int i = 0; i < 200; ++i)
+    type.fields.push_back({"f" + std::to_string(i), Scalar::float64, 0, 1, 8});
+  for (int i = 0; i < kStreams; ++i) {
+    ASSERT_TRUE(registry.create({"s", i, ""}, type, kHistory, 1));
+  }
+  local::Request watch;
+  watch.mutable_watch();
+  const UniqueFd program = connect(watch);
+  wire::FrameBuffer received(wire::kMaxLocalFrameBytes);
+  int events = 0;
+  bool is_done = false;
+  const auto take_frames = [&] {
+    while (const auto frame = received.next().value()) {
+      local::Response response;
+      ASSERT_TRUE(response.ParseFromArray(frame->data(), static_cast<int>(frame->size())));
+      EXPECT_FALSE(is_done);
+      events += response.has_stream_event();
+      is_done = response.serial() == 2;
+    }
+  };
+  run_turns(loop, 100);
+  while (!is_done) {
+    const std::span<std::byte> space = received.space();
+    const ssize_t got = ::recv(program.get(), space.data(), space.size(), MSG_DONTWAIT);
+    ASSERT_GT(got, 0) << "after " << events << " events";
+    received.commit(static_cast<std::size_t>(got));
+    take_frames();
+    run_turns(loop, 20);
+  }
+  EXPECT_EQ(events, kStreams);
 }
 
 }  // namespace
