@@ -73,6 +73,7 @@ Json host_json(const HostInfo& host) {
       host.carried_bytes_per_s > 0 ? Json(host.carried_bytes_per_s) : Json();
   json["streams"] = is_up(host.state) ? Json(host.streams) : Json();
   json["clock_bound_ns"] = bound_json(host.clock_bound());
+  json["clock_distance_ns"] = bound_json(host.clock_distance);
   json["insecure"] = host.insecure;
   json["reason"] = host.reason == HostReason::none ? Json() : Json(name_of(host.reason));
   json["error"] = or_null(host.error);

@@ -329,20 +329,31 @@ std::string good_clock_text(const Facts& facts, const HostInfo& self) {
                      self.clock_reference);
 }
 
-// With the samples of other PCs, while this PC's clock is not good.
-std::string what_policy_does(const Facts& facts) {
+// The samples of other PCs, while this PC's clock is not good: dssmd also measures the clocks of
+// two PCs against each other, and that may be enough.
+std::string effect_on_reads(const Facts& facts) {
   const std::string& policy = facts.daemon.clock_policy;
-  if (policy == dssm::name_of(ClockPolicy::enforce)) {
+  const bool refuses = policy == dssm::name_of(ClockPolicy::enforce);
+  if (!refuses && policy != dssm::name_of(ClockPolicy::mark)) return "";
+  std::vector<std::string> good, bad;
+  for (const HostInfo& host : facts.hosts) {
+    if (host.state == HostState::up) (host.clock_reason.empty() ? good : bad).push_back(host.name);
+  }
+  if (bad.empty() && !good.empty()) {
     return fmt::format(
-        "; until it is good, streams of other PCs are not opened here; with "
-        "clock_policy = \"mark\" in {} they are, and their times are marked as bad",
-        facts.daemon.config_file.empty() ? "a file for `dssmd --config`"
-                                         : facts.daemon.config_file);
+        "; the times of the samples of {} are good here, for as long as what is "
+        "measured between the PCs proves it",
+        list_text(good));
   }
-  if (policy == dssm::name_of(ClockPolicy::mark)) {
-    return "; until it is good, the times of other PCs' samples are marked as bad";
-  }
-  return "";
+  const std::string until = bad.empty() ? "; unless what is measured between two PCs is enough, "
+                                        : "; until it is good, ";
+  const std::string whose = bad.empty() ? "other PCs" : list_text(bad);
+  if (!refuses) return until + "the times of the samples of " + whose + " are marked as bad";
+  return fmt::format(
+      "{}streams of {} are not opened here; with clock_policy = \"mark\" in {} they are, and their "
+      "times are marked as bad",
+      until, whose,
+      facts.daemon.config_file.empty() ? "a file for `dssmd --config`" : facts.daemon.config_file);
 }
 
 // As dssmd uses it. It is an error when reads by time fail for it: a PC without others has none.
@@ -374,7 +385,7 @@ Finding check_clock(const Facts& facts) {
       clock.reason == ClockReason::no_chronyd) {
     advice = {"chrony is not installed", "sudo apt install chrony"};
   }
-  finding.text += what_policy_does(facts);
+  finding.text += effect_on_reads(facts);
   const bool refused = std::any_of(facts.hosts.begin(), facts.hosts.end(),
                                    [](const HostInfo& host) { return host.clock_refused; });
   if (refused) {

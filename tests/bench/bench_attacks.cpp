@@ -175,6 +175,7 @@ const std::vector<Attack>& attacks() {
     for (int i = 0; i < 16; ++i) all += list;
     return all;
   }();
+  static const std::string watch = local_frame([](local::Request& r) { r.mutable_watch(); });
   static const std::vector<Attack> all = {
       {"16 lists at once, read slowly",
        [](const std::string& socket, const std::string&) {
@@ -194,6 +195,23 @@ const std::vector<Attack>& attacks() {
          for (;;) {
            for (Hostile& one : many) one.send_some(list);
            ::usleep(1000);
+         }
+       }},
+      {"20 programs watch and never read",
+       [](const std::string& socket, const std::string&) {
+         std::vector<Hostile> many;
+         for (int i = 0; i < 20; ++i) many.push_back(Hostile::local(socket));
+         for (;;) {
+           for (Hostile& one : many) one.send_some(watch);
+           ::usleep(1000);
+         }
+       }},
+      {"a program watches again and again",
+       [](const std::string& socket, const std::string&) {
+         Hostile hostile = Hostile::local(socket);
+         for (;;) {
+           hostile.send(watch);
+           hostile.receive(1U << 20);
          }
        }},
       {"a program sets a property of 1 MiB",
@@ -243,6 +261,24 @@ const std::vector<Attack>& attacks() {
          for (;;) {
            hostile.send(frame);
            hostile.receive(wire::kMaxPropertyBytes);
+         }
+       }},
+      {"a peer asks for lists",
+       [](const std::string&, const std::string& address) {
+         const std::string frame = network_frame([](net::Frame& f) { f.mutable_list(); });
+         Hostile hostile = Hostile::remote(address);
+         for (;;) {
+           hostile.send(frame);
+           hostile.receive(50'000);
+         }
+       }},
+      {"a peer watches again and again",
+       [](const std::string&, const std::string& address) {
+         const std::string frame = network_frame([](net::Frame& f) { f.mutable_watch(); });
+         Hostile hostile = Hostile::remote(address);
+         for (;;) {
+           hostile.send(frame);
+           hostile.receive(1U << 20);
          }
        }},
       {"20 peers send 1 MiB of empty messages",

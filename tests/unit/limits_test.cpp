@@ -150,6 +150,8 @@ Values values_of_the_code() {
       DSSM_TIME(kMaxTurn),
       DSSM_COUNT(DataCommunicator::kRequestsPerTurn),
       DSSM_TIME(DataCommunicator::kMaxTurn),
+      DSSM_COUNT(LocalService::kStreamsPerTurn),
+      DSSM_BYTES(LocalService::kStreamBytesPerTurn),
       DSSM_COUNT(StreamWatch::kStreamsPerTurn),
       DSSM_BYTES(FrameConnection::kBytesPerTurn),
       DSSM_BYTES(wire::FrameDecoder::kCollectedPerReceive),

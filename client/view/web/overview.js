@@ -53,7 +53,7 @@ export class Overview {
       state.title = `for ${duration(host.state_for_ns)}`;
       setText(trip, host.round_trip_ns ? duration(host.round_trip_ns) : kUnknown);
       setText(streams, host.streams === null ? kUnknown : String(host.streams));
-      showBound(bound, host.clock_bound_ns, limitNs);
+      showBound(bound, host.clock_distance_ns, limitNs);
       setText(address, host.addresses.join(", "));
       const notes = [host.insecure ? "not encrypted" : "", host.error ?? host.reason ?? ""];
       setText(note, notes.filter((text) => text).join("; "));
@@ -202,7 +202,7 @@ export class Overview {
 function makeHost() {
   const row = element("tr");
   row.append(element("th", { scope: "row" }));
-  const labels = ["State", "Round trip", "Streams", "Clock bound", "Address", "Note"];
+  const labels = ["State", "Round trip", "Streams", "Clock, from here", "Address", "Note"];
   for (const text of labels) {
     const numeric = text === "Round trip" || text === "Streams";
     row.append(element("td", { class: numeric ? "number" : null, "data-label": text }));

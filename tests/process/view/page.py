@@ -131,6 +131,7 @@ def overview(page, program, *streams):
     for host in ["pc1", "pc2", "pc3"]:
         row = f"#hosts tr[data-host='{host}']"
         page.wait(host, lambda: page.get(row, "data-state") in ["self", "up"])
+        page.wait(f"{host}'s clock", lambda: page.get(f"{row} .bar", "data-level") == "ok")
     for stream in streams:
         page.wait(stream, lambda: page.one(stream_row(stream)))
     page.wait("the writer", lambda: program in page.one("#streams").text)

@@ -308,21 +308,31 @@ TEST(Doctor, PrintsACommandThatSetsKeysOfTheConfiguration) {
             "listen = [\"0.0.0.0:4000\"]\ninsecure = true\n#insecure = false\nname = \"pc1\"\n");
 }
 
-TEST(Doctor, SaysWhatTheClockPolicyDoesWithoutAGoodClock) {
+TEST(Doctor, SaysWhatABadClockMeansForReads) {
   Facts facts = with_clocks();
   facts.hosts[0].clock =
       clock_of(ClockStatus::out_of_bounds, ClockReason::no_chronyd, ClockBasis::nothing);
   facts.clock.state = ClockFacts::State::no_chrony;
   facts.daemon.config_file = "/etc/pc1.conf";
-  for (const auto& [policy, words] :
-       {std::pair("enforce", "not opened here; with clock_policy = \"mark\" in /etc/pc1.conf"),
-        std::pair("mark", "are marked as bad")}) {
+  Facts alone = facts, refused = facts;
+  alone.hosts.pop_back();
+  refuse(refused, "this PC's clock is out of bounds");
+  const auto expect = [](Facts facts, const std::string& policy, const std::string& words) {
     facts.daemon.clock_policy = policy;
-    EXPECT_NE(finding_of(facts, "clock").text.find(words), std::string::npos)
-        << finding_of(facts, "clock").text;
+    const std::string text = finding_of(facts, "clock").text;
+    EXPECT_NE(text.find(words), std::string::npos) << text;
+  };
+  const std::string marked = "clock_policy = \"mark\" in /etc/pc1.conf";
+  expect(refused, "enforce",
+         "until it is good, streams of pc2 are not opened here; with " + marked);
+  expect(refused, "mark", "until it is good, the times of the samples of pc2 are marked as bad");
+  expect(alone, "enforce", "is enough, streams of other PCs are not opened here; with " + marked);
+  expect(alone, "mark", "is enough, the times of the samples of other PCs are marked as bad");
+  for (const char* policy : {"enforce", "mark"}) {
+    expect(facts, policy, "the times of the samples of pc2 are good here, for as long as");
   }
   facts.daemon.clock_policy = "off";
-  EXPECT_EQ(finding_of(facts, "clock").text.find("other PCs"), std::string::npos);
+  EXPECT_EQ(finding_of(facts, "clock").text.find("pc2"), std::string::npos);
 }
 
 TEST(Doctor, SaysWhetherConnectionsAreEncrypted) {

@@ -102,6 +102,28 @@ TEST_F(FleetServiceTest, ListsThisHostFirstAndWhatIsWrongWithIt) {
   EXPECT_EQ(shown.error(), fleet->hosts().at(1).error());
 }
 
+TEST_F(FleetServiceTest, NamesTheStreamsOfOtherHostsByHostNameAndId) {
+  EXPECT_EQ(fleet->next_stream({}), nullptr);
+  run_until(loop, [this] { return catalog.hosts().size() == 2; });
+  const auto add = [this](const StreamId& id) {
+    StreamInfo stream;
+    stream.id = id;
+    ASSERT_TRUE(catalog.stream_added((*catalog.find_host(id.host))->greeting.host_id, stream));
+  };
+  add({"a", 0, "pc3"}), add({"b", 1, "pc2"}), add({"b", 0, "pc2"});
+  add({"a", 2, "pc2"}), add({"c", 0, "pc3"});
+  std::vector<std::string> names;
+  for (const StreamInfo* stream = fleet->next_stream({}); stream;
+       stream = fleet->next_stream(stream->id)) {
+    names.push_back(stream->id.str());
+  }
+  EXPECT_EQ(names,
+            (std::vector<std::string>{"a:2@pc2", "b:0@pc2", "b:1@pc2", "a:0@pc3", "c:0@pc3"}));
+  // After streams that are not there any more.
+  EXPECT_EQ(fleet->next_stream({"a", 9, "pc2"})->id.str(), "b:0@pc2");
+  EXPECT_EQ(fleet->next_stream({"z", 0, "pc2"})->id.str(), "a:0@pc3");
+}
+
 // --- nodes
 
 class NodesTest : public FleetServiceTest {
