@@ -247,7 +247,7 @@ void LocalService::watch(ClientNumber number, std::uint64_t serial) {
   if (client.watch) begun.serials = std::move(client.watch->serials);
   begun.serials.push_back(serial);
   client.watch = std::move(begun);
-  if (tell_streams(number)) client.output->request_turn();
+  client.output->request_turn();
 }
 
 bool LocalService::tell_streams(ClientNumber number) {

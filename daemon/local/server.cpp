@@ -231,7 +231,7 @@ void Connection::serve_frames() {
       readable_.disable();
       return next_turn_.enable_in(Duration::zero());
     }
-    if (service_.tell_streams(number_) || !is_open()) continue;
+    if (has_reader_ && (service_.tell_streams(number_) || !is_open())) continue;
     const auto frame = input_.next();
     if (!frame) return end_with(frame.error());
     if (!*frame) {

@@ -4,9 +4,12 @@
 #include <fmt/format.h>
 #include <google/protobuf/stubs/logging.h>
 #include <sanitizer/allocator_interface.h>
+#include <sys/mman.h>
 #include <time.h>
 
 #include <algorithm>
+#include <array>
+#include <cstdint>
 #include <cstdlib>
 
 namespace dssm::fuzz {
@@ -22,14 +25,49 @@ std::size_t fed_bytes = 0;
 constexpr std::size_t kSampleBytes = 64U << 10;
 thread_local std::size_t not_measured = 0;
 thread_local std::size_t peak_memory = 0;
+// Of the newest large block, only what has been used counts: protobuf reserves up to 50 MB for a
+// string in a message that claims to be longer than what is around it, then finds that the bytes are
+// not there (ReadStringFallback() of its parse_context.cc).
+constexpr std::size_t kLargeBytes = 1U << 20, kMaxReservedBytes = 50'000'100;
+thread_local std::uintptr_t large_block = 0;  // 0: none
+thread_local std::size_t large_bytes = 0;
 
-void on_malloc(const volatile void*, std::size_t bytes) {
+// How many bytes of the newest large block are not in memory.
+std::size_t unused_bytes() {
+  if (large_block == 0) return 0;
+  constexpr std::uintptr_t kPage = 4096;
+  static std::array<unsigned char, kMaxReservedBytes / kPage + 2> in_memory;
+  const std::uintptr_t begin = (large_block + kPage - 1) / kPage * kPage;
+  const std::size_t pages = (large_block + large_bytes - begin) / kPage;
+  // NOLINTNEXTLINE(performance-no-int-to-ptr)
+  if (::mincore(reinterpret_cast<void*>(begin), pages * kPage, in_memory.data())) return 0;
+  const auto unused = std::count_if(in_memory.begin(), in_memory.begin() + pages,
+                                    [](unsigned char state) { return (state & 1) == 0; });
+  return static_cast<std::size_t>(unused) * kPage;
+}
+
+void measure(std::size_t not_counted) {
+  const std::size_t all = __sanitizer_get_current_allocated_bytes();
+  peak_memory = std::max(peak_memory, all - not_counted);
+}
+
+void on_malloc(const volatile void* block, std::size_t bytes) {
   not_measured += bytes;
   if (not_measured < kSampleBytes) return;
   not_measured = 0;
-  peak_memory = std::max(peak_memory, __sanitizer_get_current_allocated_bytes());
+  if (bytes >= kLargeBytes && bytes <= kMaxReservedBytes) {
+    measure(unused_bytes() + bytes);  // as it was before this block
+    large_block = reinterpret_cast<std::uintptr_t>(block);
+    large_bytes = bytes;
+  }
+  measure(unused_bytes());
 }
-void on_free(const volatile void*) {}
+
+void on_free(const volatile void* block) {
+  if (large_block == 0 || reinterpret_cast<std::uintptr_t>(block) != large_block) return;
+  measure(unused_bytes());
+  large_block = 0;
+}
 
 std::int64_t processor_time_ns() {
   timespec time{};

@@ -56,13 +56,19 @@ class FakeClient final : public ClientOutput {
     received_descriptors.push_back(std::move(descriptors));
   }
 
-  void request_turn() override { ++turns; }
-  // Its next turn; false: it needs no other one.
-  bool take_turn() { return service_.tell_streams(number_); }
+  void request_turn() override { wants_turn = true; }
+  // Its turn, if it wants one; false: it needs no other one.
+  bool take_turn() {
+    wants_turn = wants_turn && service_.tell_streams(number_);
+    return wants_turn;
+  }
 
   bool put(const local::Request& request) {
     const std::string bytes = request.SerializeAsString();
-    return service_.on_frame_untrusted(number_, std::as_bytes(std::span(bytes)), offered);
+    const bool goes_on =
+        service_.on_frame_untrusted(number_, std::as_bytes(std::span(bytes)), offered);
+    take_turn();
+    return goes_on;
   }
 
   // Sends `request` under a new serial and gives what came back first.
@@ -97,7 +103,7 @@ class FakeClient final : public ClientOutput {
   std::deque<std::vector<UniqueFd>> received_descriptors;
   std::vector<UniqueFd> last_descriptors;
   DescriptorQueue offered;
-  int turns = 0;  // requested
+  bool wants_turn = false;
 
  private:
   static Identity program_of(std::int32_t pid) {
