@@ -15,6 +15,14 @@
 namespace dssm::daemon {
 namespace {
 
+// Without who asks for it getting anything.
+bool changes_something(const local::Request& request) noexcept {
+  const std::optional<Action> action = action_of(request);
+  return action == Action::close || action == Action::remove || action == Action::set_property ||
+         action == Action::describe || action == Action::offer_for_reading ||
+         action == Action::offer_for_writing;
+}
+
 StreamId id_of(const proto::StreamEvent& event) {
   const proto::StreamId& id = event.stream().id();
   return {id.name(), id.id(), id.host()};
@@ -90,6 +98,7 @@ bool LocalService::on_frame_untrusted(ClientNumber number, std::span<const std::
     return refuse(client, serial,
                   {Errc::protocol, "the first request on a connection has to be Hello"});
   }
+  if (!client.has_reader && !changes_something(request)) return true;
   if (Result<void> allowed = check_access(client, request); !allowed) {
     send_failure(client, serial, allowed.error());
   } else if (must_wait(request)) {
@@ -252,7 +261,7 @@ void LocalService::watch(ClientNumber number, std::uint64_t serial) {
 
 bool LocalService::tell_streams(ClientNumber number) {
   Client& client = clients_.at(number);
-  if (!client.watch || !client.watch->is_telling) return false;
+  if (!client.has_reader || !client.watch || !client.watch->is_telling) return false;
   const std::vector<proto::StreamEvent> events = next_events(client);
   const bool is_telling = client.watch->is_telling;
   std::vector<std::uint64_t> serials;

@@ -80,6 +80,9 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   //   by_client  the client ended the connection, or ended itself: what it had not closed before,
   //              it did not close. Otherwise dssmd ended it, and the client may connect again
   void disconnect(ClientNumber number, bool by_client = false);
+  // The client has ended, or will receive nothing more. Of the requests that it sent before, those
+  // are served that change something: they say which streams it closed.
+  void on_reader_gone(ClientNumber number) { clients_.at(number).has_reader = false; }
   bool has_greeted(ClientNumber number) const { return clients_.at(number).greeted; }
   std::size_t clients() const noexcept { return clients_.size(); }
 
@@ -113,6 +116,7 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
     std::shared_ptr<const ClientIdentity> identity;
     ClientOutput* output = nullptr;
     bool greeted = false;
+    bool has_reader = true;  // of what is sent
     std::optional<Watch> watch;
     std::size_t deferred_bytes = 0;
     std::size_t awaited = 0;  // answers of other hosts

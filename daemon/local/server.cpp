@@ -231,7 +231,7 @@ void Connection::serve_frames() {
       readable_.disable();
       return next_turn_.enable_in(Duration::zero());
     }
-    if (has_reader_ && (service_.tell_streams(number_) || !is_open())) continue;
+    if (service_.tell_streams(number_) || !is_open()) continue;
     const auto frame = input_.next();
     if (!frame) return end_with(frame.error());
     if (!*frame) {
@@ -299,10 +299,10 @@ bool Connection::send_some(Outgoing& outgoing) {
   return true;
 }
 
-// The client has ended, or does not read any more. What it sent before is still served, because it
-// says which streams it closed; then its end comes.
+// The client has ended, or does not read any more. What it sent before comes first, then its end.
 void Connection::stop_output() {
   has_reader_ = false;
+  service_.on_reader_gone(number_);
   writable_.disable();
   output_timer_.disable();
   output_.clear();

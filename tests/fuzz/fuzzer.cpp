@@ -26,8 +26,8 @@ constexpr std::size_t kSampleBytes = 64U << 10;
 thread_local std::size_t not_measured = 0;
 thread_local std::size_t peak_memory = 0;
 // Of the newest large block, only what has been used counts: protobuf reserves up to 50 MB for a
-// string in a message that claims to be longer than what is around it, then finds that the bytes are
-// not there (ReadStringFallback() of its parse_context.cc).
+// string in a message that claims to be longer than what is around it, then finds that the bytes
+// are not there (ReadStringFallback() of its parse_context.cc).
 constexpr std::size_t kLargeBytes = 1U << 20, kMaxReservedBytes = 50'000'100;
 thread_local std::uintptr_t large_block = 0;  // 0: none
 thread_local std::size_t large_bytes = 0;

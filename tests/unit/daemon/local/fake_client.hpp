@@ -57,6 +57,7 @@ class FakeClient final : public ClientOutput {
   }
 
   void request_turn() override { wants_turn = true; }
+  void stop_reading() { service_.on_reader_gone(number_); }
   // Its turn, if it wants one; false: it needs no other one.
   bool take_turn() {
     wants_turn = wants_turn && service_.tell_streams(number_);

@@ -219,6 +219,28 @@ TEST(LocalService, NotifiesWatchersOfExistingStreamsAndOfChanges) {
   EXPECT_TRUE(client.received.empty()) << "who does not watch hears nothing";
 }
 
+TEST(LocalService, ServesOnlyChangesToAClientThatReceivesNothing) {
+  LocalDaemon daemon;
+  FakeClient client(daemon.service, 5);
+  client.greet();
+  client.ask(create_request("a"));
+  client.stop_reading();
+  local::Request request = list_request();
+  request.set_serial(7);
+  EXPECT_TRUE(client.put(request));
+  request.mutable_watch();
+  EXPECT_TRUE(client.put(request));
+  request = create_request("b");
+  request.set_serial(7);
+  EXPECT_TRUE(client.put(request));
+  EXPECT_TRUE(client.received.empty());
+  EXPECT_FALSE(daemon.registry.knows({"b", 0, ""}));
+  request.mutable_set_property()->mutable_id()->set_name("a");
+  request.mutable_set_property()->set_property("x");
+  EXPECT_TRUE(client.put(request));
+  EXPECT_EQ((*daemon.registry.find({"a", 0, ""}))->property().value(), "x");
+}
+
 TEST(LocalService, TellsManyStreamsInParts) {
   constexpr int kStreams = 2 * LocalService::kStreamsPerTurn + 1;
   LocalDaemon daemon;

@@ -85,6 +85,31 @@ TEST_F(ServerTest, DisconnectsAProgramThatDoesNotRead) {
   EXPECT_FALSE(is_closed(slow));
 }
 
+TEST_F(ServerTest, AnswersNothingToAProgramThatHasEnded) {
+  registry.create({"map", 0, ""}, odometry_type(), kHistory, 1).value();
+  ASSERT_TRUE(registry.set_property({"map", 0, ""}, std::string(1 << 20, 'p')));
+  local::Request get, look;
+  get.set_serial(2);
+  get.mutable_get_property()->mutable_id()->set_name("map");
+  look.set_serial(3);
+  look.mutable_get_daemon();
+  int looks = 0;
+  service.set_facts_source([&] {
+    ++looks;
+    return DaemonFacts();
+  });
+  UniqueFd program = connect(get);
+  std::string more;
+  for (int i = 0; i < 100; ++i) more += wire::encode_frame(look);
+  EXPECT_EQ(::send(program.get(), more.data(), more.size(), 0), std::ssize(more));
+  run_turns(loop, 20);
+  EXPECT_EQ(looks, 0) << "its requests wait until it reads";
+  program.reset();
+  run_turns(loop, 50);
+  EXPECT_EQ(service.clients(), 0u);
+  EXPECT_EQ(looks, 0);
+}
+
 TEST_F(ServerTest, TellsManyStreamsAsFastAsAProgramReads) {
   constexpr int kStreams = 300;
   TypeInfo type = odometry_type();
