@@ -139,8 +139,15 @@ Result<void> Mirror::on_gap_untrusted(Tid first, std::uint64_t count) {
 Result<void> Mirror::on_refused(ChannelClient::Request request, const Error& why) {
   // The subscription before goes on: the stream is being removed, and its last samples come.
   if (request == ChannelClient::Request::subscribe && channel_.takes_samples()) return {};
-  if (ring_ && why.code == Errc::not_found) ring_->end_filling();
-  stop(why, why.code == Errc::not_found);
+  const bool is_forbidden = why.code == Errc::no_permission;
+  const bool is_removed = is_forbidden || why.code == Errc::not_found;
+  const bool was_removed = is_removed_;
+  if (ring_ && is_removed) ring_->end_filling();
+  stop(why, is_removed);
+  // This host has lost the right to read it: its readers ask again, and get that answer.
+  if (is_forbidden && ring_ && !was_removed && parts_.on_ring_replaced) {
+    parts_.on_ring_replaced(*ring_->stream());
+  }
   return {};
 }
 
@@ -311,7 +318,8 @@ bool Mirror::is_filling() const noexcept {
 }
 
 proto::Mirror::State Mirror::shown_state() const noexcept {
-  if (is_removed_) return proto::Mirror::REMOVED;
+  const bool is_forbidden = last_error_ && last_error_->code == Errc::no_permission;
+  if (is_removed_ && !is_forbidden) return proto::Mirror::REMOVED;
   if (is_filling()) return proto::Mirror::FILLING;
   if (channel_.takes_samples()) return proto::Mirror::LIVE;
   return ring_ && last_error_ ? proto::Mirror::OWNER_UNAVAILABLE : proto::Mirror::CONNECTING;

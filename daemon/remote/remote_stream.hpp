@@ -28,10 +28,10 @@
 //                         catalog has the stream again or a program opens it. But when the owner
 //                         refuses Open to a remote writer and another program waits, that one's
 //                         request is sent on the same channel
-//   is_removed_           set by Ended and by the Failure not_found (not for a remote writer that
-//                         creates the stream), cleared by Opened and other Failures. While it is
-//                         set, programs do not get the ring that is still here: their open() waits
-//                         for the owner's answer
+//   is_removed_           set by Ended, by the Failure not_found (not for a remote writer that
+//                         creates the stream) and, for a mirror, no_permission, cleared by Opened
+//                         and other Failures. While it is set, programs do not get the ring that is
+//                         still here: their open() waits for the owner's answer
 #pragma once
 
 #include <fmt/core.h>
@@ -270,7 +270,7 @@ class RemoteStream : private Dialer::Observer, protected channel::ChannelClient:
   const StreamId id_;
   const std::string name_;           // for messages
   std::optional<Error> last_error_;  // why it is not live
-  bool is_removed_ = false;          // the owner has no such stream
+  bool is_removed_ = false;          // the owner has no such stream, or not for this host
   channel::ChannelClient channel_{*this};
 
  private:

@@ -38,8 +38,14 @@ class SecureHosts : public testing::Test {
     }
     void reload() const { ::kill(dssmd.pid(), SIGHUP); }
     // One more line of the configuration, the last one.
+    // In place of the line with that key, if there is one.
     void configure_also(const std::string& line) const {
-      std::ofstream(dir + "/dssmd.conf", std::ios::app) << line << "\n";
+      const std::string path = dir + "/dssmd.conf", key = line.substr(0, line.find('='));
+      std::string all, other;
+      for (std::ifstream file(path); std::getline(file, other);) {
+        if (!other.starts_with(key)) all += other + "\n";
+      }
+      std::ofstream(path) << all << line << "\n";
       reload();
     }
     // Puts what `dssmctl pki` made into the credentials.
@@ -179,6 +185,21 @@ TEST_F(SecureHosts, EndWhatIsNotAllowedAnyMore) {
     return mirror.error.find("may not open stream 'odometry:0@pc1'") != std::string::npos;
   });
   EXPECT_EQ(reader.newest_tid(), 0);
+  // The reader is told, and goes on when it may read again.
+  await([&] {
+    Numbered sample{};
+    SampleInfo info;
+    static_cast<void>(reader.read_newest(sample, info));
+    return reader.restart_error() && reader.restart_error()->code == Errc::no_permission;
+  });
+  pc1.configure_also("rights = [\"host:pc2 read odometry\"]");
+  await([&] {
+    Numbered sample{};
+    SampleInfo info;
+    return reader.read_newest(sample, info) == ReadStatus::ok && info.tid == 1;
+  });
+  EXPECT_FALSE(reader.restart_error());
+  EXPECT_EQ(reader.restarts(), 0u) << "it is the same stream";
 }
 
 TEST_F(SecureHosts, ServeAProgramWithACertificate) {

@@ -466,6 +466,30 @@ TEST_F(MirrorsTest, RequestsARemovedStreamAgainWhenAProgramOpensIt) {
   until_state(proto::Mirror::LIVE);
 }
 
+TEST_F(MirrorsTest, HasItsReadersAskAgainWhenThisHostMayNotReadTheStreamAnyMore) {
+  const std::shared_ptr<Stream> stream = opened(5);
+  owner->cut();
+  run_until(loop, [&] { return owner->connections() == 2; });
+  owner->fail(owner->receive(), Errc::no_permission, "host 'pc1' may not read 'odometry:0@pc2'");
+  run_until(loop, [&] { return !replaced.empty(); });
+  EXPECT_EQ(replaced, std::vector<const Stream*>{stream.get()});
+  EXPECT_EQ(state().state(), proto::Mirror::OWNER_UNAVAILABLE);
+  EXPECT_EQ(state().error(), "host 'pc1' may not read 'odometry:0@pc2'");
+  const auto answer = open();
+  EXPECT_FALSE(answer->has_value()) << "only the owner knows";
+  run_until(loop, [&] { return owner->connections() == 3; });
+  owner->fail(owner->receive(), Errc::no_permission, "no");
+  EXPECT_EQ(wait_error(answer).code, Errc::no_permission);
+  EXPECT_EQ(replaced.size(), 1u) << "they know, and ask by themselves";
+  // It may read it again.
+  const auto again = open();
+  run_until(loop, [&] { return owner->connections() == 4; });
+  serve(6);
+  owner->send_caught_up();
+  EXPECT_EQ(wait(again), stream);
+  EXPECT_EQ(replaced.size(), 1u);
+}
+
 TEST_F(MirrorsTest, ContinuesWithARingThatAProgramKept) {
   std::vector<UniqueFd> kept;
   {
