@@ -220,7 +220,15 @@ std::vector<int> Stream::descriptors_to_keep() const {
 }
 
 Result<std::shared_ptr<const ring::RingMapping>> Stream::map_for_writing() const {
-  return ring::RingMapping::open_untrusted(files_.ring.get(), ring::Access::read_write);
+  auto ring =
+      DSSM_TRY(ring::RingMapping::open_untrusted(files_.ring.get(), ring::Access::read_write),
+               "stream '" + plan_.id.str() + "'");
+  if (ring->geometry() == mapping_->geometry()) return ring;
+  return Error{Errc::protocol,
+               fmt::format("stream '{}': a program has overwritten what the ring's header says "
+                           "about its size; `dssmctl rm` the stream, and let its writer create it "
+                           "again",
+                           plan_.id.str())};
 }
 
 Result<std::shared_ptr<ring::Bell>> Stream::map_bell() const {

@@ -125,6 +125,8 @@ class Stream : public std::enable_shared_from_this<Stream> {
   std::vector<int> descriptors_to_keep() const;
 
   // The ring for dssmd itself: for reading, for writing (mirrors), and its bell.
+  //   fails  protocol: a program that may write has overwritten the header. Its geometry then says
+  //          where samples go, and could lead out of the ring
   const ring::RingMapping& mapping() const noexcept { return *mapping_; }
   Result<std::shared_ptr<const ring::RingMapping>> map_for_writing() const;
   Result<std::shared_ptr<ring::Bell>> map_bell() const;

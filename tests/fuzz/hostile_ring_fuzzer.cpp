@@ -100,6 +100,7 @@ class Rig final : private FrameConnection::Observer,
         break;
       case 5:
         static_cast<void>(stream_->info());
+        open_again();
         static_cast<void>(ring::PublisherCursors(mapping_->header()).last_untrusted(what / 8));
         break;
       case 6:
@@ -112,6 +113,12 @@ class Rig final : private FrameConnection::Observer,
   }
 
  private:
+  // As for the next remote program that writes.
+  void open_again() {
+    const auto again = stream_->map_for_writing();
+    if (again && (*again)->geometry() != mapping_->geometry()) std::abort();
+  }
+
   // Begins again at a sample near the newest one, or at one that the input says.
   void subscribe(unsigned what) {
     if (sender_.busy()) return;

@@ -655,5 +655,32 @@ TEST(Registry, NotifiesItsObserversOfAdditionsAndRemovals) {
   EXPECT_EQ(other.text, "+a+b=b");
 }
 
+// A program that may write a stream can write into its header, too.
+TEST(Registry, OpensNoRingForWritingWhoseSizeAProgramHasOverwritten) {
+  Registry registry("pc1", kLimits);
+  const std::shared_ptr<Stream> stream =
+      registry.create({"lidar", 0, ""}, {"Scan", 4000, 8, {}}, {2, std::chrono::milliseconds(1)}, 1)
+          .value()
+          .stream;
+  const auto of_program = stream->map_for_writing().value();
+  const ring::Geometry right = stream->mapping().geometry();
+  // Small slots, many of them: a file of the same length.
+  Result<ring::Geometry> wrong = ring::Geometry::of(1, 2);
+  while (wrong->total_bytes < right.total_bytes) wrong = ring::Geometry::of(1, wrong->depth + 1);
+  ASSERT_EQ(wrong->total_bytes, right.total_bytes);
+  ring::RingHeader& header = of_program->header();
+  header.payload_bytes = wrong->payload_bytes;
+  header.depth = wrong->depth;
+  header.slot_bytes = wrong->slot_bytes;
+  header.times_offset = wrong->times_offset;
+  header.slots_offset = wrong->slots_offset;
+  const auto opened = stream->map_for_writing();
+  ASSERT_FALSE(opened);
+  EXPECT_EQ(opened.error().code, Errc::protocol);
+  EXPECT_NE(opened.error().message.find("'lidar:0@pc1': a program has overwritten"),
+            std::string::npos)
+      << opened.error().message;
+}
+
 }  // namespace
 }  // namespace dssm::daemon
