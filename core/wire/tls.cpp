@@ -36,8 +36,9 @@ constexpr std::uint64_t kRecordsPerKey = 1U << 23;
 // Records decrypted by one receive(): 1 MiB, or the turns of others would wait for one that sends
 // its bytes one by one.
 constexpr int kMaxReads = 64;
-// Messages of TLS itself without data between them; a handshake has six.
-constexpr unsigned kMaxMessages = 32;
+// Messages of TLS itself: a handshake has six, and a change of keys, which takes as long as some
+// KiB of data, comes after much more data than this.
+constexpr std::uint64_t kMaxMessages = 32, kDataBytesPerMessage = 1U << 20;
 
 // The buffer for encrypted output, of the thread, so that connections with nothing to send have
 // none.
@@ -137,7 +138,7 @@ class TlsTransport final : public Transport {
         if (done != 1) return stopped(done, received);
         filled += count;
         received += count;
-        messages_ = 0;
+        data_bytes_ += count;
         if (++reads == kMaxReads) {
           has_more_input_ = true;
           return IoResult{IoStatus::ok, received};
@@ -273,8 +274,8 @@ class TlsTransport final : public Transport {
   // ended.
   std::optional<Error> failure(int done) {
     const int kind = SSL_get_error(session_, done);
-    if (kind == SSL_ERROR_WANT_READ || kind == SSL_ERROR_ZERO_RETURN) return std::nullopt;
     if (lower_error_) return lower_error_;
+    if (kind == SSL_ERROR_WANT_READ || kind == SSL_ERROR_ZERO_RETURN) return std::nullopt;
     if (!refusal_.empty()) return Error{Errc::no_permission, refusal_};
     if (end_) return std::nullopt;
     const unsigned long code = ERR_peek_last_error();
@@ -343,10 +344,15 @@ class TlsTransport final : public Transport {
     return 0;
   }
 
-  // OpenSSL handles these without an end while they come.
-  static void on_message(int is_sent, int, int type, const void*, std::size_t, SSL*, void* self) {
+  // OpenSSL handles these without an end while they come. When it believes that the other side has
+  // ended, it stops before the next one.
+  static void on_message(int is_sent, int, int type, const void*, std::size_t, SSL* session,
+                         void* of) {
+    auto& self = *static_cast<TlsTransport*>(of);
     if (is_sent || type != SSL3_RT_HANDSHAKE) return;
-    ++static_cast<TlsTransport*>(self)->messages_;
+    if (++self.messages_ <= kMaxMessages + self.data_bytes_ / kDataBytesPerMessage) return;
+    self.lower_error_ = Error{Errc::protocol, "the other side changes its keys all the time"};
+    SSL_set_shutdown(session, SSL_RECEIVED_SHUTDOWN);
   }
 
   static int on_write(BIO* bio, const char* bytes, std::size_t count, std::size_t* written) {
@@ -361,10 +367,6 @@ class TlsTransport final : public Transport {
   static int on_read(BIO* bio, char* bytes, std::size_t count, std::size_t* read) {
     auto& self = *static_cast<TlsTransport*>(BIO_get_data(bio));
     BIO_clear_retry_flags(bio);
-    if (self.messages_ > kMaxMessages) {
-      self.lower_error_ = Error{Errc::protocol, "the other side sends nothing but new keys"};
-      return 0;
-    }
     // The last receive took all that was there.
     if (std::exchange(self.is_input_taken_, false)) return BIO_set_retry_read(bio), 0;
     const iovec space{bytes, count};
@@ -413,11 +415,11 @@ class TlsTransport final : public Transport {
   std::size_t output_sent_ = 0;
   std::size_t batch_bytes_ = kBatchBytes;
   bool has_more_input_ = false;
-  bool is_input_taken_ = false;      // by the last call of lower_->receive()
-  bool end_ = false;                 // of the input
-  std::uint64_t records_ = 0;        // sent
-  unsigned messages_ = 0;            // of TLS itself, since data came
-  std::optional<Error> ended_with_;  // after data that was received before
+  bool is_input_taken_ = false;                  // by the last call of lower_->receive()
+  bool end_ = false;                             // of the input
+  std::uint64_t records_ = 0;                    // sent
+  std::uint64_t messages_ = 0, data_bytes_ = 0;  // received: of TLS itself, and of data
+  std::optional<Error> ended_with_;              // after data that was received before
   std::optional<Error> lower_error_;
   std::string refusal_;  // of the other side's certificate
 };

@@ -210,7 +210,7 @@ class Server {
   Limits limits_;
   LocalService& service_;
   MemoryBudget messages_{kMaxMessageBytes};
-  Logger& logger_;
+  RateLimitedLogger logger_;  // how often programs come and are refused is decided by them
   std::uint64_t next_ = 0;
   std::map<uid_t, UserAccount> users_;  // before the connections, which hold shares of the budgets
   std::map<std::uint64_t, std::unique_ptr<Connection>> connections_;

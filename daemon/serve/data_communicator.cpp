@@ -104,6 +104,9 @@ Result<void> DataCommunicator::on_frame(net::Frame& frame) {
     if (!frame.has_failure()) {
       return Error{Errc::protocol, "a request has no serial; it takes one above 0"};
     }
+    if (!their_failure_.message.empty()) {
+      return Error{Errc::protocol, "a final failure comes once, at the end"};
+    }
     their_failure_ = wire::failure(frame.failure());
     return {};
   }

@@ -228,35 +228,74 @@ TEST_F(Tls, TakesABreakWithinManyShortRecords) {
 }
 
 // By OpenSSL itself, which sends what our transport does not.
-TEST_F(Tls, EndsAConnectionThatSendsNothingButNewKeys) {
-  make(Authority::host("pc1"));
-  int ends[2];
-  ASSERT_EQ(::socketpair(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0, ends), 0);
-  const UniqueFd socket(ends[0]);
-  const BareSession session = bare_client("pc1", socket.get());
-  TlsHandshake to(make(Authority::host("pc2")),
-                  make_transport(UniqueFd(ends[1]), TransportEnd::accepted),
-                  TransportEnd::accepted);
-  for (bool both = false; !both;) {
-    const bool one = SSL_do_handshake(session.get()) == 1;
-    both = step(to, server, server_error) && one;
+class TlsOfBareClient : public Tls {
+ protected:
+  // Connected, with `groups` for the key exchange, as OpenSSL names them; nullptr: all it has.
+  void connect_bare(const char* groups = nullptr) {
+    make(Authority::host("pc1"));
+    int ends[2];
+    ASSERT_EQ(::socketpair(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0, ends), 0);
+    socket = UniqueFd(ends[0]);
+    session = bare_client("pc1", socket.get());
+    if (groups) SSL_set1_groups_list(session.get(), groups);
+    TlsHandshake to(make(Authority::host("pc2")),
+                    make_transport(UniqueFd(ends[1]), TransportEnd::accepted),
+                    TransportEnd::accepted);
+    for (bool both = false; !both && !server_error;) {
+      const bool one = SSL_do_handshake(session.get()) == 1;
+      both = step(to, server, server_error) && one;
+    }
   }
+  void change_keys(int times, int and_ask) const {
+    for (int i = 0; i < times; ++i) {
+      ASSERT_EQ(SSL_key_update(session.get(), and_ask), 1);
+      ASSERT_EQ(SSL_do_handshake(session.get()), 1);
+    }
+  }
+  std::optional<Error> next_error() {
+    std::optional<Error> error;
+    for (int i = 0; i < 100 && !error; ++i) error = receive_error(*server);
+    return error;
+  }
+
+  UniqueFd socket;
+  BareSession session{nullptr, SSL_free};
+};
+
+TEST_F(TlsOfBareClient, EndsAConnectionThatChangesItsKeysAllTheTime) {
+  connect_bare();
   ASSERT_TRUE(server);
-  for (int i = 0; i < 20; ++i) {
-    ASSERT_EQ(SSL_key_update(session.get(), SSL_KEY_UPDATE_NOT_REQUESTED), 1);
-    ASSERT_EQ(SSL_do_handshake(session.get()), 1);
-  }
+  change_keys(20, SSL_KEY_UPDATE_NOT_REQUESTED);
   EXPECT_FALSE(receive_error(*server)) << "some are allowed";
-  ASSERT_EQ(SSL_write(session.get(), "data", 4), 4);
-  EXPECT_FALSE(receive_error(*server));
-  for (int i = 0; i < 40; ++i) {
-    ASSERT_EQ(SSL_key_update(session.get(), SSL_KEY_UPDATE_NOT_REQUESTED), 1);
-    ASSERT_EQ(SSL_do_handshake(session.get()), 1);
+  for (int i = 0; i < 20; ++i) {
+    ASSERT_EQ(SSL_write(session.get(), "data", 4), 4);
+    change_keys(1, SSL_KEY_UPDATE_NOT_REQUESTED);
   }
-  std::optional<Error> error;
-  for (int i = 0; i < 10 && !error; ++i) error = receive_error(*server);
+  const std::optional<Error> error = next_error();
   ASSERT_TRUE(error);
-  EXPECT_EQ(error->message, "the other side sends nothing but new keys");
+  EXPECT_EQ(error->message, "the other side changes its keys all the time");
+}
+
+TEST_F(TlsOfBareClient, AnswersOnlySomeOfManyChangesOfKeysThatComeAtOnce) {
+  connect_bare();
+  ASSERT_TRUE(server);
+  change_keys(200, SSL_KEY_UPDATE_REQUESTED);
+  const std::optional<Error> error = next_error();
+  ASSERT_TRUE(error);
+  EXPECT_EQ(error->message, "the other side changes its keys all the time");
+  std::array<char, 100'000> answers{};
+  const ssize_t got = ::recv(socket.get(), answers.data(), answers.size(), MSG_DONTWAIT);
+  constexpr ssize_t kAnswerBytes = 27, kTicketBytes = 4000;
+  EXPECT_LT(got, 40 * kAnswerBytes + kTicketBytes);
+}
+
+TEST_F(TlsOfBareClient, RefusesKeyExchangesThatTakeLong) {
+  connect_bare("ffdhe8192");
+  ASSERT_TRUE(server_error);
+  EXPECT_EQ(server_error->code, Errc::protocol) << server_error->message;
+  server_error.reset();
+  connect_bare("P-256");
+  EXPECT_TRUE(server);
 }
 
 TEST_F(Tls, NoticesTheEnd) {

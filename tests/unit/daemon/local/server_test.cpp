@@ -23,14 +23,18 @@ class ServerTest : public testing::Test, protected LocalDaemon {
   ServerTest() : LocalDaemon(false, {100, 100}) {}
   ~ServerTest() override { std::filesystem::remove_all(dir); }
 
-  // A program that has sent Hello and `request`.
-  UniqueFd connect(local::Request request) {
+  UniqueFd connect() const {
     sockaddr_un address{};
     address.sun_family = AF_UNIX;
     std::strncpy(address.sun_path, path.c_str(), sizeof address.sun_path - 1);
     UniqueFd program(::socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0));
     EXPECT_EQ(::connect(program.get(), reinterpret_cast<const sockaddr*>(&address), sizeof address),
               0);
+    return program;
+  }
+  // A program that has sent Hello and `request`.
+  UniqueFd connect(local::Request request) {
+    UniqueFd program = connect();
     local::Request hello;
     hello.set_serial(1);
     hello.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);
@@ -83,6 +87,18 @@ TEST_F(ServerTest, DisconnectsAProgramThatDoesNotRead) {
   EXPECT_TRUE(logger.contains("a program has read nothing for 10 s of the "));
   pass(Duration(1));
   EXPECT_FALSE(is_closed(slow));
+}
+
+TEST_F(ServerTest, LogsOnlySomeOfManyProgramsThatAreRefused) {
+  const std::string garbage(16, '\xff');
+  for (int i = 0; i < 200; ++i) {
+    const UniqueFd program = connect();
+    EXPECT_EQ(::send(program.get(), garbage.data(), garbage.size(), 0), std::ssize(garbage));
+    run_turns(loop, 10);
+    EXPECT_TRUE(is_closed(program));
+  }
+  EXPECT_GE(logger.warnings.size(), 10u);
+  EXPECT_LE(logger.warnings.size(), std::size_t{2 * RateLimitedLogger::kLinesPerPeriod});
 }
 
 TEST_F(ServerTest, AnswersNothingToAProgramThatHasEnded) {

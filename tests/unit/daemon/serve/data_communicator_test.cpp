@@ -84,6 +84,18 @@ TEST(DataCommunicator, LogsTheFinalFailureOfAPeer) {
   EXPECT_TRUE(rig.logger.warnings.empty());
 }
 
+TEST(DataCommunicator, TakesOneFinalFailure) {
+  ServerRig rig;
+  MemoryPeer peer;
+  rig.connect(peer);
+  peer.put(failure_frame(Errc::closed, "had enough"));
+  rig.turns();
+  EXPECT_FALSE(peer.closed);
+  peer.put(failure_frame(Errc::closed, "had more than enough"));
+  rig.turns();
+  EXPECT_TRUE(peer.closed);
+}
+
 // --- requests
 
 TEST(DataCommunicator, AnswersUnknownRequestsAndContinues) {
