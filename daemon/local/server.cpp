@@ -113,8 +113,8 @@ Listener::~Listener() {
 // --- one connection
 
 Connection::Connection(const EventLoop& loop, UniqueFd socket, const Identity& identity,
-                       LocalService& service, MemoryBudget& messages, UserAccount& user,
-                       Logger& logger, std::function<void()> on_closed)
+                       LocalService& service, TurnQueue& turns, MemoryBudget& messages,
+                       UserAccount& user, Logger& logger, std::function<void()> on_closed)
     : socket_(std::move(socket)),
       service_(service),
       logger_(logger),
@@ -123,10 +123,11 @@ Connection::Connection(const EventLoop& loop, UniqueFd socket, const Identity& i
       input_(wire::kMaxLocalRequestBytes),
       messages_(messages),
       user_(user),
+      turns_(turns),
+      turn_(turns, identity.account(), [this] { guarded([this] { serve_frames(); }); }),
       readable_(EventSource::readable(loop, socket_.get(),
                                       [this] { guarded([this] { on_readable(); }); })),
       writable_(EventSource::writable(loop, socket_.get(), [this] { on_writable(); })),
-      next_turn_(EventSource::timer(loop, [this] { guarded([this] { serve_frames(); }); })),
       greeting_timeout_(EventSource::timer(
           loop,
           [this] {
@@ -225,11 +226,13 @@ bool Connection::take_descriptors(std::vector<UniqueFd> arrived) {
 }
 
 void Connection::serve_frames() {
+  if (!turn_.may_begin()) return readable_.disable();
+  const TurnQueue::Work work(turns_);
   const MonoTime begin = MonoClock::now();
   for (int served = 0; is_open() && !is_paused(); ++served) {
     if (served == kRequestsPerTurn || (served > 0 && MonoClock::now() - begin > kMaxTurn)) {
       readable_.disable();
-      return next_turn_.enable_in(Duration::zero());
+      return turn_.wait();
     }
     if (service_.tell_streams(number_) || !is_open()) continue;
     const auto frame = input_.next();
@@ -308,7 +311,7 @@ void Connection::stop_output() {
   output_.clear();
   queued_bytes_ = queued_descriptors_ = 0;
   output_share_ = {};
-  next_turn_.enable_in(Duration::zero());
+  turn_.wait();
 }
 
 void Connection::on_writable() {
@@ -324,7 +327,7 @@ void Connection::on_writable() {
   if (output_.empty()) writable_.disable();
   charge(queued_bytes_, output_share_);
   // Whole frames may be waiting in input_; for them the socket does not become readable.
-  if (!is_paused()) next_turn_.enable_in(Duration::zero());
+  if (!is_paused()) turn_.wait();
 }
 
 // The final failure is sent as far as the socket takes it at once; the connection does not wait for
@@ -340,7 +343,7 @@ void Connection::close(bool by_client) {
   if (!is_open()) return;
   readable_.disable();
   writable_.disable();
-  next_turn_.disable();
+  turn_.stop();
   greeting_timeout_.disable();
   request_timeout_.disable();
   output_timer_.disable();
@@ -361,6 +364,7 @@ Server::Server(const EventLoop& loop, const Listener& listener, const std::strin
       limits_(limits),
       service_(service),
       logger_(logger),
+      turns_(loop),
       sweep_(EventSource::timer(loop, [this] { sweep(); })),
       acceptor_(loop, logger, "a program", host, message_id::kClientRefused,
                 [this](UniqueFd& socket) { return accept(socket); }) {
@@ -417,8 +421,8 @@ void Server::keep(UniqueFd socket, const Identity& identity, UserAccount& user) 
     sweep_.enable_in(Duration::zero());
   };
   connections_.emplace(
-      number, std::make_unique<Connection>(loop_, std::move(socket), identity, service_, messages_,
-                                           user, logger_, on_closed));
+      number, std::make_unique<Connection>(loop_, std::move(socket), identity, service_, turns_,
+                                           messages_, user, logger_, on_closed));
   ++user.clients;
 }
 

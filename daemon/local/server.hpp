@@ -29,6 +29,7 @@
 #include "daemon/base/limit_use.hpp"
 #include "daemon/base/log.hpp"
 #include "daemon/base/memory_budget.hpp"
+#include "daemon/base/turn_queue.hpp"
 #include "daemon/local/local_service.hpp"
 
 namespace dssm::daemon {
@@ -122,14 +123,14 @@ class Connection final : public ClientOutput {
   //   on_closed  called once, when the connection ended by itself; the connection must not be
   //              destroyed within it
   Connection(const EventLoop& loop, UniqueFd socket, const Identity& identity,
-             LocalService& service, MemoryBudget& messages, UserAccount& user, Logger& logger,
-             std::function<void()> on_closed);
+             LocalService& service, TurnQueue& turns, MemoryBudget& messages, UserAccount& user,
+             Logger& logger, std::function<void()> on_closed);
   Connection(const Connection&) = delete;
   Connection& operator=(const Connection&) = delete;
   ~Connection();
 
   void send(std::string bytes, std::vector<UniqueFd> descriptors) override;
-  void request_turn() override { next_turn_.enable_in(Duration::zero()); }
+  void request_turn() override { turn_.wait(); }
 
  private:
   struct Outgoing {
@@ -181,7 +182,9 @@ class Connection final : public ClientOutput {
   using Progress = std::pair<std::uint64_t, int>;
   Progress progress() const noexcept;
   std::optional<Progress> watched_;  // none: nothing waits
-  EventSource readable_, writable_, next_turn_, greeting_timeout_, request_timeout_, output_timer_;
+  TurnQueue& turns_;
+  TurnQueue::Turn turn_;
+  EventSource readable_, writable_, greeting_timeout_, request_timeout_, output_timer_;
 };
 
 // Accepts the programs of this PC, within the limits, and owns their connections.
@@ -211,6 +214,7 @@ class Server {
   LocalService& service_;
   MemoryBudget messages_{kMaxMessageBytes};
   RateLimitedLogger logger_;  // how often programs come and are refused is decided by them
+  TurnQueue turns_;
   std::uint64_t next_ = 0;
   std::map<uid_t, UserAccount> users_;  // before the connections, which hold shares of the budgets
   std::map<std::uint64_t, std::unique_ptr<Connection>> connections_;

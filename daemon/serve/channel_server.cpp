@@ -42,6 +42,7 @@ ChannelServer::ChannelServer(const Parts& parts, wire::Greeting self,
       peers_(limits),
       handshake_budget_(parts.loop),
       streams_(parts.loop),
+      turns_(parts.loop),
       sweep_(EventSource::timer(parts.loop, [this] { sweep(); })),
       acceptor_(parts.loop, logger_, "a connection", self_.host, message_id::kPeerRefused,
                 [this](UniqueFd& socket) { return accept(socket); }) {
@@ -167,7 +168,7 @@ Result<void> ChannelServer::keep(std::unique_ptr<wire::Transport>& transport,
                                  const wire::SocketAddress& address) {
   const std::string where = without_port(address);
   const wire::CertifiedPeer* certified = transport->peer();
-  const std::string peer = certified ? certified->str() : in_quotes(where);
+  const std::string peer = account_of(address.str(), certified);
   const bool is_configured = parts_.is_configured && parts_.is_configured(address, certified);
   const bool is_crowd = peers_.is_full_for(peer, certified);
   if (is_crowd || (peers_.is_full() && !is_configured)) {
@@ -177,8 +178,9 @@ Result<void> ChannelServer::keep(std::unique_ptr<wire::Transport>& transport,
   }
   PeerPlace place = DSSM_TRY(peers_.admit(peer, certified, is_configured), refuses(address));
   auto communicator = std::make_unique<DataCommunicator>(
-      DataCommunicator::Parts{parts_.loop, parts_.registry, parts_.opens, streams_, self_, logger_,
-                              *this, parts_.clock, parts_.rights, sending_, parts_.playback},
+      DataCommunicator::Parts{parts_.loop, parts_.registry, parts_.opens, streams_, turns_, self_,
+                              logger_, *this, parts_.clock, parts_.rights, sending_,
+                              parts_.playback},
       std::move(place), std::move(transport), address.str());
   DataCommunicator* key = communicator.get();
   communicators_.emplace(key, std::move(communicator));

@@ -16,6 +16,7 @@
 #include "daemon/base/acceptor.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/log.hpp"
+#include "daemon/base/turn_queue.hpp"
 #include "daemon/link/handshake.hpp"
 #include "daemon/link/network_listener.hpp"
 #include "daemon/serve/data_communicator.hpp"
@@ -121,6 +122,7 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
   std::list<Arrival> arrivals_;  // the oldest first
   SendingDemands sending_;
   ServedStreams streams_;
+  TurnQueue turns_;
   MonoTime checked_{};  // all streams
   std::map<DataCommunicator*, std::unique_ptr<DataCommunicator>> communicators_;
   std::vector<DataCommunicator*> ended_;  // to be destroyed outside of their own callbacks

@@ -63,14 +63,8 @@ DataCommunicator::DataCommunicator(const Parts& parts, PeerPlace place,
       peer_address_(std::move(peer_address)),
       link_(parts.loop, std::move(transport), *this, kMaxQueuedBytes),
       catalog_(parts.registry, parts.opens, kMaxListBytes),
-      next_turn_(EventSource::timer(parts.loop,
-                                    [this] {
-                                      try {
-                                        work_now();
-                                      } catch (const std::bad_alloc&) {
-                                        link_.close_with(no_memory_left());
-                                      }
-                                    })),
+      turn_(parts.turns, account_of(peer_address_, link_.peer()), [this] { work_guarded(); }),
+      next_turn_(EventSource::timer(parts.loop, [this] { work_guarded(); })),
       greeting_timeout_(EventSource::timer(
           parts.loop,
           [this] {
@@ -110,7 +104,8 @@ Result<void> DataCommunicator::on_frame(net::Frame& frame) {
     their_failure_ = wire::failure(frame.failure());
     return {};
   }
-  if (served_ < kRequestsPerTurn && served_for_ < kMaxTurn && can_serve(frame)) {
+  if (served_ < kRequestsPerTurn && served_for_ < kMaxTurn && can_serve(frame) &&
+      turn_.may_begin()) {
     serve(frame);
     return {};
   }
@@ -126,7 +121,8 @@ Result<void> DataCommunicator::on_frame(net::Frame& frame) {
   link_.pause();
   // Otherwise work_now() serves it when what is in progress ends. History does not keep its pace
   // then.
-  if (can_serve(waiting_->request) || (channel_ && channel_->busy())) work_soon();
+  if (can_serve(waiting_->request)) turn_.wait();
+  if (channel_ && channel_->busy()) work_soon();
   return {};
 }
 
@@ -189,6 +185,7 @@ void DataCommunicator::become_control() {
 
 void DataCommunicator::serve(const net::Frame& request) {
   ++served_;
+  const TurnQueue::Work work(parts_.turns);
   const MonoTime begin = MonoClock::now();
   if (Result<void> done = dispatch(request); !done) send_failure(request.serial(), done.error());
   served_for_ += MonoClock::now() - begin;
@@ -377,6 +374,14 @@ void DataCommunicator::work_soon() {
 
 void DataCommunicator::on_output_empty() { work_now(); }
 
+void DataCommunicator::work_guarded() {
+  try {
+    work_now();
+  } catch (const std::bad_alloc&) {
+    link_.close_with(no_memory_left());
+  }
+}
+
 [[gnu::hot]] void DataCommunicator::work_now() {
   if (!link_.is_open()) return;
   if (std::exchange(turn_is_due_, false)) next_turn_.disable();
@@ -386,7 +391,7 @@ void DataCommunicator::on_output_empty() { work_now(); }
     const std::uint64_t serial = opening_->serial;
     if (Result<void> opened = go_on_opening(); !opened) send_failure(serial, opened.error());
   }
-  if (waiting_ && can_serve(waiting_->request)) {
+  if (waiting_ && can_serve(waiting_->request) && turn_.may_begin()) {
     const Waiting waiting = *std::exchange(waiting_, std::nullopt);
     serve(waiting.request);
     link_.resume();
@@ -395,8 +400,11 @@ void DataCommunicator::on_output_empty() { work_now(); }
     const Result<void> worked = channel_->work(waiting_.has_value());
     if (!worked) return link_.close_with(worked.error());
   }
-  if (watch_ && watch_->work()) work_soon();
-  if (waiting_ && can_serve(waiting_->request)) work_soon();
+  if (watch_ && watch_->has_more() && turn_.may_begin()) {
+    const TurnQueue::Work work(parts_.turns);
+    if (watch_->work()) turn_.wait();
+  }
+  if (waiting_ && can_serve(waiting_->request)) turn_.wait();
 }
 
 void DataCommunicator::check_peer_timeout() {
@@ -445,6 +453,7 @@ void DataCommunicator::on_recovered() {
 // --- the end
 
 void DataCommunicator::on_closed(const Error& why) {
+  turn_.stop();
   next_turn_.disable();
   greeting_timeout_.disable();
   idle_timeout_.disable();

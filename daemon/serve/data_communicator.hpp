@@ -23,6 +23,7 @@
 #include "core/wire/transport.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/log.hpp"
+#include "daemon/base/turn_queue.hpp"
 #include "daemon/link/frame_connection.hpp"
 #include "daemon/serve/peer_table.hpp"
 #include "daemon/serve/served_stream.hpp"
@@ -52,6 +53,7 @@ class StreamWatch {
   // Sends events while the link takes them. True when others should have their turn and work() be
   // called again; else nothing is left, or on_output_empty() comes.
   bool work();
+  bool has_more() const noexcept { return !pending_.empty() || serial_ != 0; }
 
   void on_stream_added(const Stream& stream);
   void on_property_set(const Stream& stream);
@@ -112,6 +114,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
     Registry& registry;
     const OpenTable& opens;
     ServedStreams& streams;
+    TurnQueue& turns;
     const wire::Greeting& self;
     Logger& logger;
     Observer& observer;
@@ -160,6 +163,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   void on_closed(const Error& why) override;
   void work_now() override;
   void work_soon() override;
+  void work_guarded();
 
   Result<void> greet(const net::Frame& frame);
   void become_control();
@@ -199,7 +203,8 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   std::optional<Opening> opening_;
   std::unique_ptr<StreamChannel> channel_;
   std::set<Action> allowed_;  // on the channel
-  bool turn_is_due_ = false;
+  TurnQueue::Turn turn_;      // to serve what waits
+  bool turn_is_due_ = false;  // to go on with what is in progress
   EventSource next_turn_, greeting_timeout_, idle_timeout_, peer_timeout_;
 };
 

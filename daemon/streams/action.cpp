@@ -49,7 +49,14 @@ std::string Identity::str() const {
 
 std::string Identity::account() const {
   if (is_local()) return is_limited(uid) ? fmt::format("user {}", uid) : std::string();
-  return certified ? certified->str() : in_quotes(address.substr(0, address.rfind(':')));
+  return account_of(address, certified ? &*certified : nullptr);
+}
+
+std::string account_of(const std::string& address, const wire::CertifiedPeer* certified) {
+  if (certified) return certified->str();
+  // A program may use each of 127.0.0.1 to 127.255.255.254.
+  const bool is_this_pc = address.starts_with("127.") || address.starts_with("[::ffff:127.");
+  return in_quotes(is_this_pc ? "127.0.0.1" : address.substr(0, address.rfind(':')));
 }
 
 std::optional<Action> action_of(const local::Request& request) noexcept {

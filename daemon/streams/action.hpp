@@ -26,6 +26,10 @@
 
 namespace dssm::daemon {
 
+// Who is charged for what a remote client takes: whom its certificate names, or its address without
+// the port, all of this PC as one.
+std::string account_of(const std::string& address, const wire::CertifiedPeer* certified);
+
 // A value.
 struct Identity {
   // Of a program of this PC.

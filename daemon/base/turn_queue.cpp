@@ -1,0 +1,46 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/base/turn_queue.hpp"
+
+#include <utility>
+
+namespace dssm::daemon {
+
+TurnQueue::Turn::Turn(TurnQueue& queue, std::string account, std::function<void()> take)
+    : queue_(queue), account_(std::move(account)), take_(std::move(take)) {}
+
+bool TurnQueue::Turn::may_begin() {
+  if (is_called_ || (queue_.waiting_.empty() && queue_.used_ < kMaxTurn)) return true;
+  wait();
+  return false;
+}
+
+void TurnQueue::Turn::wait() {
+  if (std::exchange(is_waiting_, true)) return;
+  std::list<Turn*>& others = queue_.waiting_[account_];
+  place_ = others.insert(others.end(), this);
+  queue_.next_.enable_in(Duration::zero());
+}
+
+void TurnQueue::Turn::stop() noexcept {
+  if (!std::exchange(is_waiting_, false)) return;
+  const auto of_account = queue_.waiting_.find(account_);
+  of_account->second.erase(place_);
+  if (of_account->second.empty()) queue_.waiting_.erase(of_account);
+}
+
+void TurnQueue::run() {
+  used_ = {};
+  while (!waiting_.empty() && used_ < kMaxTurn) {
+    auto of_account = waiting_.upper_bound(last_);
+    if (of_account == waiting_.end()) of_account = waiting_.begin();
+    last_ = of_account->first;
+    Turn& turn = *of_account->second.front();
+    turn.stop();
+    turn.is_called_ = true;
+    turn.take_();
+    turn.is_called_ = false;
+  }
+  if (!waiting_.empty()) next_.enable_in(Duration::zero());
+}
+
+}  // namespace dssm::daemon

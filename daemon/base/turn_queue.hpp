@@ -1,0 +1,75 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Bounds the time of the loop that clients get together, however many there are: samples and timers
+// of others must not wait until each of a thousand connections had its turn.
+#pragma once
+
+#include <functional>
+#include <list>
+#include <map>
+#include <string>
+
+#include "daemon/base/event_loop.hpp"
+
+namespace dssm::daemon {
+
+// The clients of one server. In each turn of the loop they work for kMaxTurn together, and as long
+// as the last piece of work takes. Who has to wait is called later: one account after another, of
+// each the client that has waited longest.
+//
+//   threads  one
+class TurnQueue {
+ public:
+  static constexpr Duration kMaxTurn = std::chrono::milliseconds(1);
+
+  // One client's place.
+  class Turn {
+   public:
+    // queue: outlives this.
+    //   account  whose turn it is, as Identity::account()
+    //   take     called from the loop after wait(); must not destroy this
+    Turn(TurnQueue& queue, std::string account, std::function<void()> take);
+    Turn(const Turn&) = delete;
+    Turn& operator=(const Turn&) = delete;
+    ~Turn() { stop(); }
+
+    // Whether the client may work now. If not, it waits.
+    bool may_begin();
+    void wait();           // no effect if it waits already
+    void stop() noexcept;  // it does not wait any more
+
+   private:
+    friend class TurnQueue;
+    TurnQueue& queue_;
+    const std::string account_;
+    const std::function<void()> take_;
+    bool is_waiting_ = false, is_called_ = false;
+    std::list<Turn*>::iterator place_{};  // while it waits
+  };
+
+  // Measures a piece of work from its construction to its end.
+  class Work {
+   public:
+    explicit Work(TurnQueue& queue) : queue_(queue) {}
+    Work(const Work&) = delete;
+    Work& operator=(const Work&) = delete;
+    ~Work() { queue_.used_ += MonoClock::now() - begin_; }
+
+   private:
+    TurnQueue& queue_;
+    const MonoTime begin_ = MonoClock::now();
+  };
+
+  explicit TurnQueue(const EventLoop& loop) : next_(EventSource::timer(loop, [this] { run(); })) {}
+
+ private:
+  void run();
+
+  // By account; none is empty.
+  std::map<std::string, std::list<Turn*>> waiting_;
+  std::string last_;  // account that was called
+  Duration used_{};   // since run(), or of several turns of the loop in which nobody had to wait
+  EventSource next_;
+};
+
+}  // namespace dssm::daemon

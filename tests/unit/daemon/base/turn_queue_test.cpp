@@ -1,0 +1,71 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/base/turn_queue.hpp"
+
+#include <gtest/gtest.h>
+
+#include <string>
+
+#include "tests/unit/daemon/run_loop.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+class TurnQueueTest : public testing::Test {
+ protected:
+  // A client that always has more to do, each time for longer than all may work in one turn.
+  struct Client {
+    Client(TurnQueueTest& test, const std::string& account, std::string name)
+        : turn(test.queue, account, [&test, this, name] {
+            test.called += name;
+            test.work();
+            turn.wait();
+          }) {}
+    TurnQueue::Turn turn;
+  };
+
+  void work() {
+    const TurnQueue::Work work(queue);
+    for (const MonoTime begin = MonoClock::now(); MonoClock::now() - begin < TurnQueue::kMaxTurn;) {
+    }
+  }
+
+  EventLoop loop = EventLoop::open(TimerQueue::Time::simulated).value();
+  TurnQueue queue{loop};
+  std::string called;
+};
+
+TEST_F(TurnQueueTest, LetsAClientBeginAtOnceUntilTheTimeIsUsedUp) {
+  Client one(*this, "a", "1"), other(*this, "b", "2");
+  EXPECT_TRUE(one.turn.may_begin());
+  EXPECT_TRUE(other.turn.may_begin()) << "the first one has used no time";
+  work();
+  EXPECT_FALSE(other.turn.may_begin());
+  EXPECT_FALSE(one.turn.may_begin()) << "others wait";
+  run_turns(loop, 1);
+  EXPECT_EQ(called, "1") << "one in a turn of the loop";
+  run_turns(loop, 1);
+  EXPECT_EQ(called, "12");
+}
+
+TEST_F(TurnQueueTest, ServesOneAccountAfterAnotherHoweverManyClientsEachHas) {
+  Client a1(*this, "a", "1"), a2(*this, "a", "2"), a3(*this, "a", "3"), b(*this, "b", "b");
+  for (Client* one : {&a1, &a2, &a3, &b}) one->turn.wait();
+  run_turns(loop, 8);
+  EXPECT_EQ(called, "1b2b3b1b");
+}
+
+TEST_F(TurnQueueTest, ForgetsAClientThatHasStoppedOrIsGone) {
+  Client one(*this, "a", "1");
+  {
+    Client gone(*this, "a", "2"), stopped(*this, "b", "3");
+    for (Client* each : {&gone, &stopped, &one}) each->turn.wait();
+    stopped.turn.stop();
+    run_turns(loop, 1);
+    EXPECT_EQ(called, "2");
+  }
+  run_turns(loop, 2);
+  EXPECT_EQ(called, "211");
+}
+
+}  // namespace
+}  // namespace dssm::daemon
