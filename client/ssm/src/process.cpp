@@ -82,20 +82,24 @@ void* Process::run_reaper(void* self) {
   for (;;) {
     while (::sem_wait(&process.wake_) != 0) continue;
     const std::lock_guard guard(process.mutex_);
-    process.reaping_.store(true);
-    if (!process.exiting_.load()) process.reap_locked();
-    process.reaping_.store(false);
+    const bool is_last = process.exiting_.load();
+    if (!process.ended_.load()) process.reap_locked();
+    if (is_last) process.ended_.store(true);
   }
 }
 
-// Most programs end right after endSSM: the reaper must not be half-way through while the static
+// Most programs end right after they have closed their streams. dssmd must hear of that first, or
+// the writers count as crashed; and the reaper must not be half-way through while the static
 // objects of other libraries are destroyed. Bounded, because programs call exit() from handlers,
 // and the interrupted thread may hold what the reaper needs.
 void Process::at_exit() {
   Process& process = the_process;
+  if (!process.reaper_) return;
   process.exiting_.store(true);
+  ::sem_post(&process.wake_);
   const MonoTime deadline = deadline_in(std::chrono::seconds(1));
-  while (process.reaping_.load() && MonoClock::now() < deadline) ::usleep(100);
+  while (!process.ended_.load() && MonoClock::now() < deadline) ::usleep(100);
+  process.ended_.store(true);
 }
 
 void Process::reap_locked() {
@@ -130,7 +134,6 @@ void Process::after_fork_in_child() {
   ::sem_init(&process.wake_, 0, 0);
   ++process.generation_;
   process.reaper_ = false;
-  process.reaping_.store(false);
   process.was_registered_.store(false);
   if (Registration* const parents = std::exchange(process.registration_, nullptr)) {
     parents->next = std::exchange(process.abandoned_, parents);

@@ -139,11 +139,12 @@ class Process {
   sem_t wake_{};
   std::mutex mutex_;  // guards what is not atomic
   bool handlers_ = false;
-  bool reaper_ = false;
+  std::atomic<bool> reaper_{false};
   std::uint64_t generation_ = 1;  // rises with each fork
   Registration* registration_ = nullptr;
   Registration* abandoned_ = nullptr;  // keeps the parents' reachable for leak checkers
-  std::atomic<bool> reaping_{false}, exiting_{false};  // between the reaper and at_exit()
+  // Between at_exit() and the reaper: the next round is its last, and is over.
+  std::atomic<bool> exiting_{false}, ended_{false};
   std::atomic<std::uint64_t> ends_{0};
   std::atomic<bool> was_registered_{false};
   char socket_path_[108] = {};  // where; written before was_registered_

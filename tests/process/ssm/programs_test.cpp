@@ -8,6 +8,7 @@
 
 #include <algorithm>
 #include <cstdlib>
+#include <dssm/dssm.hpp>
 #include <fstream>
 
 #include "tests/process/ssm/run_program.hpp"
@@ -45,6 +46,22 @@ INSTANTIATE_TEST_SUITE_P(Cpp, SsmProcesses,
                          testing::Values("cpp_signals-gnu++98", "cpp_signals-c++20",
                                          "cpp_processes-gnu++98", "cpp_processes-c++20"),
                          test_name);
+
+TEST(SsmProgramThatEnds, CountsAsCrashedOnlyIfItHasNotClosedItsStream) {
+  const DaemonProcess daemon;
+  Session session = Session::connect({.socket_path = daemon.socket_path()}).value();
+  for (int i = 0; i < 20; ++i) {
+    const Finished finished =
+        run({built("tests/process/ssm/cpp_ended-gnu++98")}, {daemon.environment()});
+    ASSERT_EQ(finished.exit_status, 0) << finished.out << finished.err;
+  }
+  StreamInfo info;
+  await([&] {
+    info = session.stream_info({"ended", 0, ""}).value();
+    return info.writers == 0;
+  });
+  EXPECT_EQ(info.crashed_writers, 0u) << info.last_crashed_writer;
+}
 
 TEST(SsmProgramAcrossRestart, LosesNoSampleWhenDssmdIsKilledAndRestarted) {
   DaemonProcess daemon({"--log-level", "warning"});
