@@ -179,6 +179,17 @@ std::optional<ProgramType> obvious_type_of_programs(Session& session, const Stre
   return *std::move(type);
 }
 
+TypeInfo obvious_type(Session& session, const RawReader& reader, std::string_view verb) {
+  if (!reader.type().fields.empty()) return {};
+  const auto type = obvious_type_of_programs(session, reader.id());
+  if (!type) return {};
+  print_error(fmt::format(
+      "dssmctl: {}: '{}' is shown as {} of {}; `dssmctl describe {}` shows it so everywhere\n",
+      verb, escaped(reader.id().str()), escaped(type->found.type.str()), type->source,
+      escaped(reader.id().str())));
+  return type->found.type;
+}
+
 const TypeInfo& type_to_show(const TypeInfo& own, const TypeInfo& obvious) {
   return own.fields.empty() && own.payload_bytes == obvious.payload_bytes ? obvious : own;
 }

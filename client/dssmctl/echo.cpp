@@ -32,18 +32,6 @@ Result<std::vector<Field>> wanted_fields(const RawReader& reader, const TypeInfo
                   fmt::format("show '{}'", reader.id().str()));
 }
 
-// Of a stream that is not described: the type that its programs have, if there is no doubt.
-TypeInfo obvious_type(Session& session, const RawReader& reader) {
-  if (!reader.type().fields.empty()) return {};
-  const auto type = obvious_type_of_programs(session, reader.id());
-  if (!type) return {};
-  print_error(fmt::format(
-      "dssmctl: echo: '{}' is shown as {} of {}; `dssmctl describe {}` shows it so everywhere\n",
-      escaped(reader.id().str()), escaped(type->found.type.str()), type->source,
-      escaped(reader.id().str())));
-  return type->found.type;
-}
-
 // Prints the samples after the reader's cursor, in order.
 class Echo {
  public:
@@ -203,7 +191,7 @@ Result<void> run(const EchoOptions& options, Output& out) {
   if (all.empty()) return {};
   OpenedStream& opened = all.front();
   RawReader& reader = opened.reader;
-  TypeInfo obvious = obvious_type(opened.session, reader);
+  TypeInfo obvious = obvious_type(opened.session, reader, "echo");
   std::vector<Field> fields = DSSM_TRY(wanted_fields(reader, obvious, options));
   // Before the first sample is shown: after it the next ones must come too, whatever happens to
   // dssmd.

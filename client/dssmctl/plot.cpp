@@ -10,8 +10,10 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <filesystem>
 
 #include "client/dssmctl/chart.hpp"
+#include "client/dssmctl/describe_stream.hpp"
 #include "client/dssmctl/draw.hpp"
 #include "client/dssmctl/fields.hpp"
 #include "client/dssmctl/names.hpp"
@@ -37,6 +39,7 @@ class Curve {
   // target: STREAM.FIELD; `opened` is that stream, and `field` the rest
   static Result<Curve> create(std::string target, OpenedStream opened, const std::string& field) {
     Curve curve(std::move(target), std::move(opened), field);
+    curve.obvious_ = obvious_type(curve.opened_.session, curve.opened_.reader, "plot");
     DSSM_TRY(curve.find_field_again());
     curve.opened_.reader.seek(kNoTid);
     return curve;
@@ -82,7 +85,8 @@ class Curve {
       : target_(std::move(target)), opened_(std::move(opened)), field_(field) {}
 
   Result<void> find_field_again() {
-    const std::vector<Field> fields = readable_fields_untrusted(opened_.reader.type());
+    const std::vector<Field> fields =
+        readable_fields_untrusted(type_to_show(opened_.reader.type(), obvious_));
     const auto error = [&](const std::string& reason) {
       return Error{Errc::invalid_argument, fmt::format("draw '{}': {}", escaped(target_), reason)};
     };
@@ -119,6 +123,7 @@ class Curve {
   std::string target_;
   OpenedStream opened_;
   std::string field_;
+  TypeInfo obvious_;  // of its programs, if it is not described
   FieldElement found_;
   std::vector<ChartPoint> points_;
   std::vector<std::byte> payload_;
@@ -201,6 +206,11 @@ Result<void> read_all(std::vector<Curve>& curves, Duration span) {
 }
 
 Result<void> plot_file(std::vector<Curve>& curves, const PlotOptions& options, Output& out) {
+  // Before it waits for samples; gnuplot would say it in many words.
+  const std::filesystem::path folder = std::filesystem::path(options.out).parent_path();
+  if (::access(folder.empty() ? "." : folder.c_str(), W_OK)) {
+    return os_error(fmt::format("write '{}'", escaped(options.out)));
+  }
   const MonoTime history_by = deadline_in(kHistoryTime);
   const MonoTime end = options.duration ? deadline_in(*options.duration) : MonoTime{};
   const auto is_complete = [&] {

@@ -209,7 +209,9 @@ int main_program(int argc, char** argv) {
                  "A server whose pages may connect, as https://app.foxglove.dev")
       ->type_name("URL")
       ->multi_option_policy(CLI::MultiOptionPolicy::Throw);
-  app.add_option("--pages", server.pages, "The folder with the page")->type_name("FOLDER");
+  app.add_option("--pages", server.pages, "The folder with the page")
+      ->type_name("FOLDER")
+      ->envname("DSSM_VIEW_PAGES");
   std::string config;
   app.add_option("--config", config,
                  "A TOML file with options as keys, before those of the command line")
@@ -236,6 +238,11 @@ int main_program(int argc, char** argv) {
         "--revoked needs --authority\n",
         stderr);
     return kWrongUsage;
+  }
+  if (!std::filesystem::exists(server.pages / "index.html")) {
+    return report({Errc::not_found, fmt::format("there is no page in '{}'; name its folder by "
+                                                "--pages (in the sources: client/view/web)",
+                                                server.pages.string())});
   }
   const Result<void> served = serve(std::move(options));
   return served ? kSuccess : report(served.error());

@@ -39,8 +39,17 @@ Json range_json(const std::optional<TimeRange>& range) {
   return {{"oldest_ns", time_json(range->first)}, {"newest_ns", time_json(range->last)}};
 }
 
+// Whether times are of this day: those of a device's own clock, or of a recording, are not.
+bool is_about_now(Time time) {
+  constexpr Duration kDay = std::chrono::hours(24);
+  return ctl::saturating_sub(time, WallClock::now()) < kDay &&
+         ctl::saturating_sub(WallClock::now(), time) < kDay;
+}
+
+// range: of the samples that are about now; if there are none, of all.
 Json streams_json(const std::vector<StreamInfo>& streams, std::optional<TimeRange>& range) {
   range.reset();
+  std::optional<TimeRange> of_others;
   Json list = Json::array();
   for (const StreamInfo& stream : streams) {
     const std::optional<Time> oldest = oldest_time(stream);
@@ -50,8 +59,10 @@ Json streams_json(const std::vector<StreamInfo>& streams, std::optional<TimeRang
     json["mirror"] = stream.mirror ? ctl::mirror_json(*stream.mirror) : Json();
     list.push_back(std::move(json));
     // Samples of a black box may be hours older than all others.
-    if (oldest && !ctl::is_of_black_box(stream.id)) extend(range, *oldest, stream.newest_time);
+    if (!oldest || ctl::is_of_black_box(stream.id)) continue;
+    extend(is_about_now(stream.newest_time) ? range : of_others, *oldest, stream.newest_time);
   }
+  if (!range) range = of_others;
   return list;
 }
 

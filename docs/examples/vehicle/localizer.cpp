@@ -64,6 +64,7 @@ int main(int argc, char** argv) {
     return text;
   };
   vehicle::Scan scan;
+  vehicle::Pose last{};
   dssm::SampleInfo info;
   while (!vehicle::stop_requested()) {
     if (lidar.read_next(scan, info) != dssm::ReadStatus::ok) {
@@ -72,14 +73,16 @@ int main(int argc, char** argv) {
     }
     if (scan.is_end()) break;
     if (const std::optional<vehicle::Pose2> pose = odometry.at(info.time)) {
-      poses->write({pose->x_m, pose->y_m, pose->theta_rad, info.tid}, info.time);
+      last = {pose->x_m, pose->y_m, pose->theta_rad, info.tid};
+      poses->write(last, info.time);
       ++written;
     } else if (!vehicle::stop_requested()) {
       ++without_odometry;
     }
     progress.update(summary);
   }
-  poses->write({0, 0, 0, dssm::kNoTid}, info.time);  // the end mark
+  last.scan_tid = dssm::kNoTid;
+  poses->write(last, info.time);  // the end mark
   progress.print(summary());
   return complete && without_odometry + lidar.lost_samples() > 0 ? vehicle::kIncompleteStatus : 0;
 }

@@ -76,6 +76,10 @@ TEST_F(Plot, WritesFilesByGnuplot) {
   const std::string drawn = text_of(svg);
   EXPECT_TRUE(contains(drawn, "<svg")) << drawn;
   EXPECT_TRUE(contains(drawn, "a.wave.height")) << drawn;
+  const Finished nowhere = ctl({"plot", "a.wave.height", "--out", folder.file("none/a.svg")});
+  EXPECT_EQ(nowhere.exit_status, 1);
+  EXPECT_EQ(nowhere.out, "");
+  EXPECT_EQ(lines_of(nowhere.err).size(), 1U) << nowhere.err;
   EXPECT_TRUE(contains(ctl({"plot", "a.wave.height", "--out", "a.jpg"}).err,
                        "does not end in .svg or .png"));
 }

@@ -104,7 +104,10 @@ TEST_F(Describe, EchoShowsTheFieldsOfAProgramThatRuns) {
   EXPECT_THAT(echo.out, HasSubstr("theta: 0.25\n"));
   EXPECT_THAT(echo.err,
               HasSubstr("dssmctl describe spur_odometry:3@pc1` shows it so everywhere\n"));
-  EXPECT_TRUE(session.stream_info(kStream)->type.fields.empty()) << "echo changes nothing";
+  const Finished plot = ctl({"plot", "spur_odometry:3.theta", "--for", "10ms"});
+  EXPECT_EQ(plot.exit_status, 0) << plot.err;
+  EXPECT_THAT(plot.out, HasSubstr(" 0.25\n"));
+  EXPECT_TRUE(session.stream_info(kStream)->type.fields.empty()) << "they change nothing";
 }
 
 TEST_F(Describe, SaysWhyThereAreNoNames) {

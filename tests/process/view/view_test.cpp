@@ -161,6 +161,14 @@ TEST_F(View, ShowsHostsStreamsAndPrograms) {
   EXPECT_EQ(overview["nodes"][0]["program"], "the test");
   EXPECT_FALSE(overview["findings"].empty());
   EXPECT_EQ(overview["range"]["newest_ns"], overview["streams"][0]["newest_ns"]);
+  // A device that counts from its start.
+  auto device = session_.create<double>("device", depth_of(8)).value();
+  device.write(0, at_ns(10 * kSecond));
+  await([&] {
+    overview = ask({{"op", "overview"}});
+    return overview["streams"].size() == 3 && !overview["streams"][1]["newest_ns"].is_null();
+  });
+  EXPECT_EQ(overview["range"]["oldest_ns"], overview["range"]["newest_ns"]);
 
   pc3_.kill_hard();
   await([&] {
