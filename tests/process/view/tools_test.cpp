@@ -8,6 +8,7 @@
 #include <fstream>
 #include <regex>
 
+#include "docs/examples/vehicle/samples.hpp"
 #include "tests/process/view/view_fixture.hpp"
 #include "tests/support/folder.hpp"
 
@@ -34,12 +35,21 @@ struct Seen {
 };
 DSSM_DESCRIBE(Seen, isNew, boxes, range, frame, last)
 
-TEST_F(ViewTools, ServeFoxglove) {
+// The folder with Foxglove's client; nullopt: it cannot run here.
+std::optional<std::string> foxglove_client() {
   const std::string folder = source("tests/process/view/foxglove");
   if (!std::filesystem::exists(folder + "/node_modules") ||
       run({"/bin/sh", "-c", "command -v node"}).exit_status != 0) {
-    GTEST_SKIP() << "no node, or `npm ci --prefix " << folder << "` was not run";
+    return std::nullopt;
   }
+  return folder;
+}
+const char* const kNoFoxglove =
+    "no node, or `npm ci --prefix tests/process/view/foxglove` was not run";
+
+TEST_F(ViewTools, ServeFoxglove) {
+  const std::optional<std::string> folder = foxglove_client();
+  if (!folder) GTEST_SKIP() << kNoFoxglove;
   auto seen = session_.create<Seen>("seen", depth_of(8)).value();
   auto motion = on_pc2_.create<Motion>("motion:5", depth_of(8)).value();
   auto plain = session_.create_raw({"plain", 0, ""}, TypeInfo{"", 3, 1, {}}, depth_of(8)).value();
@@ -49,8 +59,8 @@ TEST_F(ViewTools, ServeFoxglove) {
   plain.write(bytes, at_ns(43));
   await_streams(1);
   for (const char* subprotocol : {"foxglove.sdk.v1", "foxglove.websocket.v1"}) {
-    const Finished client = run({"node", folder + "/client.cjs", "ws" + url_.substr(4), subprotocol,
-                                 "seen@pc1", "motion:5@pc2", "plain@pc1"});
+    const Finished client = run({"node", *folder + "/client.cjs", "ws" + url_.substr(4),
+                                 subprotocol, "seen@pc1", "motion:5@pc2", "plain@pc1"});
     EXPECT_EQ(client.exit_status, 0) << client.err;
     EXPECT_TRUE(contains(client.out, "server dssm-view on pc1 time connectionGraph\n"))
         << client.out;
@@ -64,6 +74,36 @@ TEST_F(ViewTools, ServeFoxglove) {
     EXPECT_TRUE(contains(client.out, "seen@pc1 1234567890123 {\"isnew\":true,")) << client.out;
     EXPECT_TRUE(contains(client.out, "writers plain@pc1 the test@pc1 (")) << client.out;
   }
+}
+
+TEST_F(ViewTools, ServeTheStreamsOfTheVehicleExampleToFoxglove) {
+  const std::optional<std::string> folder = foxglove_client();
+  if (!folder) GTEST_SKIP() << kNoFoxglove;
+  auto lidar = session_.create<vehicle::Scan>(vehicle::kScanStream, depth_of(8)).value();
+  auto pose = on_pc2_.create<vehicle::Pose>(vehicle::kPoseStream, depth_of(8)).value();
+  auto scan = std::make_unique<vehicle::Scan>();
+  scan->beams = 3;
+  scan->first_rad = -0.5F;
+  scan->step_rad = 0.25F;
+  for (std::size_t i = 0; i < vehicle::kMaxBeams; ++i)
+    scan->range_m[i] = 0.5F * static_cast<float>(i);
+  lidar.write(*scan, at_ns(50));
+  pose.write({1.5, -2.5, 0.25, 7}, at_ns(50));
+  await_streams(1);
+  const Finished client = run({"node", *folder + "/client.cjs", "ws" + url_.substr(4),
+                               "foxglove.sdk.v1", "lidar@pc1", "pose@pc2"});
+  EXPECT_EQ(client.exit_status, 0) << client.err;
+  EXPECT_TRUE(contains(client.out,
+                       "pose@pc2 50 {\"x_m\":1.5,\"y_m\":-2.5,\"theta_rad\":0.25,"
+                       "\"scan_tid\":7}\n"))
+      << client.out;
+  EXPECT_TRUE(contains(client.out,
+                       "lidar@pc1 50 {\"beams\":3,\"first_rad\":-0.5,\"step_rad\":0.25,"
+                       "\"range_m\":[0,0.5,1,"))
+      << client.out;
+  const std::string last = std::to_string((vehicle::kMaxBeams - 1) / 2);
+  EXPECT_TRUE(contains(client.out, "," + last + ((vehicle::kMaxBeams - 1) % 2 ? ".5]" : "]")))
+      << client.out;
 }
 
 // --- Prometheus
