@@ -111,6 +111,13 @@ Result<SavedRange> Saver::record(const WantedRange& range, std::uint64_t number)
   }
   DSSM_TRY(recorder->finish());
   for (std::string& notice : recorder->take_notices()) saved.notices.push_back(std::move(notice));
+  if (const auto hosts = session_.list_hosts(); hosts && range.streams.empty()) {
+    for (const HostInfo& host : *hosts) {
+      if (host.state != HostState::down || host.name.empty()) continue;
+      saved.notices.push_back(
+          fmt::format("host '{}' is down: its streams are not in the recording", host.name));
+    }
+  }
   saved.path = fmt::format("{}/{}/{}", kSavedPath, number, name);
   saved.streams = recorder->streams();
   saved.progress = recorder->progress();

@@ -372,6 +372,17 @@ TEST_F(View, SavesARangeAsARecording) {
   EXPECT_EQ(one["streams"], 1) << one;
   EXPECT_EQ(one["samples"], 100) << one;
 
+  pc3_.kill_hard();
+  await([&] {
+    const std::vector<HostInfo> hosts = session_.list_hosts().value();
+    return std::any_of(hosts.begin(), hosts.end(), [](const HostInfo& host) {
+      return host.name == "pc3" && host.state == HostState::down;
+    });
+  });
+  const Json without = ask({{"op", "save"}, {"from_ns", "0"}});
+  ASSERT_EQ(without["notices"].size(), 1U) << without;
+  EXPECT_EQ(without["notices"][0], "host 'pc3' is down: its streams are not in the recording");
+
   EXPECT_TRUE(contains(ask({{"op", "save"}})["error"].dump(), "'from_ns'"));
   // Names are not patterns.
   const auto samples_of = [&](const std::string& name) {
