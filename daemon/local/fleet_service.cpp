@@ -351,15 +351,17 @@ void FleetService::finish(Listing& listing) {
   then(std::exchange(listing.answers, {}));
 }
 
+// One in a turn of the loop: each may be long, and a program may ask for many.
 void FleetService::on_list_timeout() {
-  while (!listings_.empty()) {
-    const std::shared_ptr<Listing> first = listings_.front();
-    if (!first->done && first->deadline > loop_.now()) {
-      return list_timer_.enable_in(first->deadline - loop_.now());
-    }
-    listings_.pop_front();
-    finish(*first);
+  while (!listings_.empty() && listings_.front()->done) listings_.pop_front();
+  if (listings_.empty()) return;
+  const std::shared_ptr<Listing> first = listings_.front();
+  if (const Duration left = first->deadline - loop_.now(); left > Duration::zero()) {
+    return list_timer_.enable_in(left);
   }
+  listings_.pop_front();
+  finish(*first);
+  if (!listings_.empty()) list_timer_.enable_in(Duration::zero());
 }
 
 // With what has arrived, and with the catalog for hosts that have not answered.

@@ -253,7 +253,10 @@ void LocalService::log_offer(const ClientIdentity& client, const local::Offer& o
 void LocalService::watch(ClientNumber number, std::uint64_t serial) {
   Client& client = clients_.at(number);
   Watch begun;
-  if (client.watch) begun.serials = std::move(client.watch->serials);
+  if (client.watch) {
+    begun.serials = std::move(client.watch->serials);
+    begun.before = std::move(client.watch->before);
+  }
   begun.serials.push_back(serial);
   client.watch = std::move(begun);
   client.output->request_turn();
@@ -293,24 +296,41 @@ std::vector<proto::StreamEvent> LocalService::next_events(Client& client) const 
                                });
   for (; next != own.end(); ++next, ++seen) {
     if (is_full()) return events;
-    watch.own = (*next)->created_order();
-    if (shows(client, (*next)->id())) add(added_event(**next, opens_));
+    const Stream& stream = **next;
+    watch.own = stream.created_order();
+    if (shows(client, stream.id())) {
+      add(added_event(stream, opens_));
+    } else if (showed(client, stream.id())) {
+      add(removed_event(stream.id(), stream.incarnation()));
+    }
   }
   const auto next_other = [&] { return fleet_ ? fleet_->next_stream(watch.others) : nullptr; };
   for (; const StreamInfo* stream = next_other(); ++seen) {
     if (is_full()) return events;
     watch.others = stream->id;
-    if (!shows(client, stream->id)) continue;
-    proto::StreamEvent event;
-    wire::to_message(*stream, *event.mutable_stream());
-    add(std::move(event));
+    if (shows(client, stream->id)) {
+      proto::StreamEvent event;
+      wire::to_message(*stream, *event.mutable_stream());
+      add(std::move(event));
+    } else if (showed(client, stream->id)) {
+      add(removed_event(stream->id, stream->incarnation));
+    }
   }
   watch.is_telling = false;
+  watch.before.clear();
   return events;
 }
 
 bool LocalService::shows(const Client& client, const StreamId& id) const {
   return rights_.shows(*client.identity, id);
+}
+
+// Whether a client that watches may know the stream by earlier rights, and has not been told yet
+// that it may not see it any more.
+bool LocalService::showed(const Client& client, const StreamId& id) const {
+  const auto& before = client.watch->before;
+  return std::any_of(before.begin(), before.end(),
+                     [&](const auto& rights) { return rights->shows(*client.identity, id); });
 }
 
 // False when the client is disconnected by then.
@@ -364,7 +384,9 @@ void LocalService::broadcast(const proto::StreamEvent& event) {
   const std::string frame = wire::encode_frame(response);
   for (const ClientNumber number : watchers) {
     const auto client = clients_.find(number);
-    if (client != clients_.end() && shows(client->second, id_of(event))) {
+    if (client == clients_.end()) continue;
+    const StreamId id = id_of(event);
+    if (shows(client->second, id) || (event.removed() && showed(client->second, id))) {
       client->second.output->send(frame, {});
     }
   }
@@ -464,38 +486,17 @@ void LocalService::on_new_rights(const Rights& before) {
     if (open.role == Role::reader) notify_replaced({open.client->number, number, open.any_host});
     static_cast<void>(opens_.remove(open.client->number, number));  // sending may have ended it
   }
-  for (const ClientNumber number : watchers()) {
-    if (clients_.contains(number)) update_watch(number, before);
-  }
-}
-
-// What the client may not see any more is gone for it; if it may see others, it is told all again.
-void LocalService::update_watch(ClientNumber number, const Rights& before) {
-  Client& client = clients_.at(number);
-  bool sees_others = false;
-  std::vector<proto::StreamEvent> hidden;
-  const auto compare = [&](const StreamId& id, std::uint64_t incarnation) {
-    const bool is_shown = shows(client, id);
-    if (is_shown == before.shows(*client.identity, id)) return;
-    sees_others |= is_shown;
-    if (!is_shown) hidden.push_back(removed_event(id, incarnation));
-  };
-  for (const std::shared_ptr<Stream>& stream : registry_.streams()) {
-    compare(stream->id(), stream->incarnation());
-  }
-  if (fleet_) {
-    for (const StreamInfo* stream = fleet_->next_stream({}); stream;
-         stream = fleet_->next_stream(stream->id)) {
-      compare(stream->id, stream->incarnation);
-    }
-  }
-  if (sees_others) {
+  // All again and in parts, because there may be many watches and streams. The rights of several
+  // reloads that follow each other closely all count.
+  const auto of_before = std::make_shared<const Rights>(before.lines());
+  for (auto& [number, client] : clients_) {
+    if (!client.watch) continue;
     client.watch->is_telling = true;
     client.watch->own = 0;
     client.watch->others = {};
+    client.watch->before.push_back(of_before);
     client.output->request_turn();
   }
-  send_events(number, hidden);
 }
 
 // --- recovery

@@ -99,7 +99,7 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
 
   // The rights have changed: ends opens that are not allowed any more. Their readers reopen, and
   // get the failure that says why they may not. Mirrors and remote writers end that no other
-  // program has open. Watches show what they may see now.
+  // program has open. Watches are told all again: what they may see, and what not any more.
   void on_new_rights(const Rights& before);
 
  private:
@@ -111,6 +111,8 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
     std::vector<std::uint64_t> serials;  // of Watch requests that are answered at the end
     std::uint64_t own = 0;               // created_order() of the last one
     StreamId others;                     // the last one
+    // By which it may know streams that it may not see any more; empty: none.
+    std::vector<std::shared_ptr<const Rights>> before;
   };
   struct Client {
     std::shared_ptr<const ClientIdentity> identity;
@@ -144,9 +146,9 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   void broadcast(const proto::StreamEvent& event);
   std::vector<ClientNumber> watchers() const;
   bool shows(const Client& client, const StreamId& id) const;
+  bool showed(const Client& client, const StreamId& id) const;
   std::vector<proto::StreamEvent> next_events(Client& client) const;
   bool send_events(ClientNumber number, const std::vector<proto::StreamEvent>& events);
-  void update_watch(ClientNumber number, const Rights& before);
 
   bool must_wait(const local::Request& request) const;
   void defer(Client& client, const local::Request& request, std::size_t bytes);

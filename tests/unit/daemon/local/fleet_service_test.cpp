@@ -124,6 +124,16 @@ TEST_F(FleetServiceTest, NamesTheStreamsOfOtherHostsByHostNameAndId) {
   EXPECT_EQ(fleet->next_stream({"z", 0, "pc2"})->id.str(), "a:0@pc3");
 }
 
+TEST_F(FleetServiceTest, AnswersOneOfManyListsInATurnWhenAHostDoesNotAnswer) {
+  run_until(loop, [this] { return catalog.hosts().size() == 2; });
+  int answers = 0;
+  for (int i = 0; i < 3; ++i) fleet->list([&](const auto& streams) { answers += bool(streams); });
+  for (int expected = 1; expected <= 3; ++expected) {
+    run_until(loop, [&] { return answers > 0; });
+    EXPECT_EQ(std::exchange(answers, 0), 1);
+  }
+}
+
 // --- nodes
 
 class NodesTest : public FleetServiceTest {
