@@ -25,6 +25,7 @@
 #include "core/wire/request_size.hpp"
 #include "daemon/base/acceptor.hpp"
 #include "daemon/base/log.hpp"
+#include "daemon/base/turn_queue.hpp"
 #include "daemon/clock/fleet_clock.hpp"
 #include "daemon/fleet/catalog.hpp"
 #include "daemon/fleet/mdns/service_publisher.hpp"
@@ -150,6 +151,7 @@ Values values_of_the_code() {
       DSSM_TIME(kMaxTurn),
       DSSM_COUNT(DataCommunicator::kRequestsPerTurn),
       DSSM_TIME(DataCommunicator::kMaxTurn),
+      DSSM_TIME(TurnQueue::kMaxTurn),
       DSSM_COUNT(LocalService::kStreamsPerTurn),
       DSSM_BYTES(LocalService::kStreamBytesPerTurn),
       DSSM_COUNT(StreamWatch::kStreamsPerTurn),
