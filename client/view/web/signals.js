@@ -52,7 +52,9 @@ export class Signals extends EventTarget {
     this.picker = new Picker(document.querySelector("#picker"), this);
     this.pump = new Pump(connection, kPeriodMs, () => this.ask());
     time.addEventListener("mode", () => {
-      if (time.mode === "live") this.resetZoom();
+      if (time.mode !== "live") return;
+      this.resetZoom();
+      this.pump.wake(); // while held, it waits
     });
     time.addEventListener("change", () => {
       if (time.hover !== null || time.mode === "live") return this.drawCursor();

@@ -183,8 +183,11 @@ def signal(page, stream, field):
     page.wait("the stream goes on", lambda: newest() > max(before, held) + 20)
     assert shown() == held, f"held {held}, but {shown()} is shown"
     page.shot("signals-light")
+    picture = "return document.querySelector('.panel canvas').toDataURL()"
+    still = page.run(picture)
     page.press("l")
     page.wait("live again", lambda: shown() > held + 20)
+    page.wait("the curve moves", lambda: page.run(picture) != still)
     page.show_as(DESKTOP, "dark")
     page.wait("dark", lambda: page.run("return document.documentElement.dataset.theme") == "dark")
     page.shot("signals-dark")
