@@ -435,6 +435,13 @@ const kKeys = {
 };
 const kOfTime = new Set([" ", "ArrowLeft", "ArrowRight", "Home", "End", "l", "r"]);
 
+// Space presses a button that was reached by Tab. After a click it remains the page's key, also
+// when the browser marks the focus with the first key.
+let isReachedByKey = false;
+document.addEventListener("focusin", (event) => {
+  isReachedByKey = event.target.matches(":focus-visible");
+});
+
 document.addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey) return;
   const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
@@ -443,7 +450,7 @@ document.addEventListener("keydown", (event) => {
   const { target } = event;
   const isSlider = target.id === "slider";
   if (!isSlider && target.matches("input, select, textarea")) return;
-  if (key === " " && target.matches("button, summary, a")) return;
+  if (key === " " && isReachedByKey && target.matches("button, summary, a")) return;
   if (document.querySelector("dialog[open]") && key !== "?") return;
   if (kOfTime.has(key) && !page()) return;
   event.preventDefault();

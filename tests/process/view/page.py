@@ -188,6 +188,12 @@ def signal(page, stream, field):
     page.press("l")
     page.wait("live again", lambda: shown() > held + 20)
     page.wait("the curve moves", lambda: page.run(picture) != still)
+    for button in ["#tab-signals", "#live"]:
+        page.one(button).click()
+        for mode in ["hold", "live"]:
+            page.press(" ")
+            page.wait(f"{mode} by Space after a click on {button}",
+                      lambda: page.get("#time", "data-mode") == mode)
     page.show_as(DESKTOP, "dark")
     page.wait("dark", lambda: page.run("return document.documentElement.dataset.theme") == "dark")
     page.shot("signals-dark")
