@@ -194,9 +194,22 @@ def signal(page, stream, field):
             page.press(" ")
             page.wait(f"{mode} by Space after a click on {button}",
                       lambda: page.get("#time", "data-mode") == mode)
+    check_pressed(page, "light")
     page.show_as(DESKTOP, "dark")
     page.wait("dark", lambda: page.run("return document.documentElement.dataset.theme") == "dark")
     page.shot("signals-dark")
+    check_pressed(page, "dark")
+
+
+def check_pressed(page, scheme):
+    """The pressed button of the time keeps its colours below the pointer."""
+    colours = """const {color, backgroundColor} = getComputedStyle(arguments[0]);
+                 return [color, backgroundColor]"""
+    live = page.one("#live")
+    ActionChains(page.driver).move_to_element(page.one("#host")).perform()
+    before = page.run(colours, live)
+    ActionChains(page.driver).move_to_element(live).perform()
+    assert page.run(colours, live) == before, f"the pressed button changes when {scheme}"
 
 
 def recreated(page, stream, field):
