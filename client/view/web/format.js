@@ -97,6 +97,20 @@ export function number(value) {
   return value.toPrecision(7).replace(/\.?0+$/, "");
 }
 
+const kShortLabel = 7; // characters
+
+// Labels of an axis: as few digits as make them different, with exponents where that is shorter.
+export function axisLabels(values) {
+  const size = Math.max(...values.map(Math.abs)) || 1;
+  const step = Math.abs(values[1] - values[0]) || size;
+  const digits = Math.floor(Math.log10(size)) - Math.floor(Math.log10(step)) + 2;
+  const rounded = values.map((value) => Number(value.toPrecision(Math.min(15, digits))));
+  const plain = rounded.map((value) => String(value).replace("e+", "e"));
+  const short = rounded.map((value) => value.toExponential().replace("e+", "e").replace("e0", ""));
+  const lengthOf = (texts) => Math.max(...texts.map((text) => text.length));
+  return lengthOf(plain) <= Math.max(kShortLabel, lengthOf(short)) ? plain : short;
+}
+
 const two = (value) => String(value).padStart(2, "0");
 
 // Local time of day of ns since 1970 (BigInt), to `places` decimals of the second.

@@ -6,6 +6,7 @@
 import { Pump, RequestError } from "./connection.js";
 import { findField, guessKind, isFloat, signalsOf, valueOf } from "./fields.js";
 import {
+  axisLabels,
   cssColor,
   download,
   duration,
@@ -28,6 +29,9 @@ const kFewFields = 3; // shown before a person has chosen
 const kColors = 8;
 const kPlotHeight = 220;
 const kNarrowHeight = 170;
+const kFont = "11px system-ui, sans-serif";
+const kAxisPx = 58; // of the values beside a plot, for usual ones
+const kAxisGapPx = 14; // between the labels and the plot
 const kLabelPx = 80; // of the clock error beside the cursor
 const kDragPx = 4; // a shorter way of the pointer is a click
 const kMinZoomNs = 1000n;
@@ -46,6 +50,9 @@ export class Signals extends EventTarget {
     this.window = null; // {from, to}: what is drawn
     this.answers = new Map(); // stream -> what the last `signals` request brought
     this.samples = new Map(); // stream -> its sample at the cursor
+    this.axisPx = kAxisPx; // beside all plots
+    this.ruler = element("canvas").getContext("2d"); // measures labels
+    this.ruler.font = kFont;
     this.epoch = null; // x of plots is seconds since then: small enough for exact doubles
     this.box = root.querySelector("#panels");
     this.makeTools();
@@ -206,6 +213,7 @@ export class Signals extends EventTarget {
     panel.plot?.destroy();
     panel.element.remove();
     this.panels = this.panels.filter((other) => other !== panel);
+    this.align();
   }
 
   toggle(panel, signal, on) {
@@ -223,6 +231,8 @@ export class Signals extends EventTarget {
   rebuild(panel) {
     panel.plot?.destroy();
     panel.plot = null;
+    panel.axisPx = kAxisPx;
+    this.align();
     panel.legend.replaceChildren(
       ...panel.signals.map((signal, i) => {
         const [stream, host] = splitHost(signal.stream);
@@ -262,8 +272,7 @@ export class Signals extends EventTarget {
   makePlot(panel) {
     const text = cssColor("--text-2");
     const grid = { stroke: cssColor("--grid"), width: 1 };
-    const font = "11px system-ui, sans-serif";
-    const axis = { stroke: text, font, grid, ticks: { ...grid, size: 4 } };
+    const axis = { stroke: text, font: kFont, grid, ticks: { ...grid, size: 4 } };
     const stepped = uPlot.paths.stepped({ align: 1 });
     const series = panel.signals.map((signal, i) => {
       const found =
@@ -279,7 +288,7 @@ export class Signals extends EventTarget {
       ...this.plotSize(),
       padding: [8, 30, 0, 0],
       legend: { show: false },
-      scales: { x: { time: false, range: () => this.windowX() } },
+      scales: { x: { time: false, range: () => this.windowX() }, y: { range: rangeY } },
       axes: [
         {
           ...axis,
@@ -288,7 +297,11 @@ export class Signals extends EventTarget {
           incrs: kIncrements,
           values: (plot, splits, i, space, step) => splits.map((x) => this.tick(x, step)),
         },
-        { ...axis, size: 58, values: (plot, splits) => splits.map(number) },
+        {
+          ...axis,
+          size: (plot, labels) => this.axisSize(panel, labels ?? []),
+          values: (plot, splits) => axisLabels(splits),
+        },
       ],
       cursor: {
         x: false,
@@ -310,6 +323,22 @@ export class Signals extends EventTarget {
     );
     panel.plot.over.append(panel.band, panel.line);
     this.listen(panel);
+  }
+
+  // As wide as the labels of all panels need, so that equal times are below each other. A panel's
+  // part only grows until its signals change: plots whose edge moves all the time are hard to read.
+  axisSize(panel, labels) {
+    const widths = labels.map((label) => this.ruler.measureText(label).width);
+    panel.axisPx = Math.max(panel.axisPx, Math.ceil(Math.max(0, ...widths)) + kAxisGapPx);
+    this.align();
+    return this.axisPx;
+  }
+
+  align() {
+    const axisPx = Math.max(kAxisPx, ...this.panels.map((panel) => panel.axisPx));
+    if (axisPx === this.axisPx) return;
+    this.axisPx = axisPx;
+    for (const { plot } of this.panels) plot?.redraw(false, true);
   }
 
   listen(panel) {
@@ -701,6 +730,11 @@ export class Signals extends EventTarget {
     const from = this.window ? timeOfDay(this.window.from, 0).replaceAll(":", "") : "";
     return `dssm-signals-${from}.${ending}`;
   }
+}
+
+// A plot without data has an axis, too: its edge is that of the others.
+function rangeY(plot, least, greatest) {
+  return least === null ? [0, 1] : uPlot.rangeNum(least, greatest, 0.1, true);
 }
 
 // Steps of the time axis in seconds.

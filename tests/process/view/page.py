@@ -212,6 +212,22 @@ def check_pressed(page, scheme):
     assert page.run(colours, live) == before, f"the pressed button changes when {scheme}"
 
 
+def axes(page, stream, *fields):
+    """Plots have the same edges: of values as large and small as these, and without samples."""
+    page.open("signals", signals={"panels": [[[stream, field]] for field in fields]
+                                     + [[[stream, "none"], [stream, "some"]]]})
+    page.wait("curves", lambda: sum(
+        int(panel.get_attribute("data-points") or 0) > 1 for panel in page.all(".panel")
+    ) == len(fields))
+
+    def edges():
+        return {(plot.rect["x"], plot.rect["width"]) for plot in page.all(".u-over")}
+
+    page.wait("room for the labels of large values", lambda: min(edges())[0] > 90)
+    page.wait("the same edges", lambda: len(edges()) == 1)
+    page.shot("axes")
+
+
 def recreated(page, stream, field):
     """The view of a stream that is created again, with another type, gets the fields of that."""
     page.open("views", views=[{"stream": stream}])
@@ -436,7 +452,7 @@ def recording(page, stream, oldest_ns, newest_ns):
 
 
 CHECKS = {check.__name__: check for check in
-          [overview, signal, slider, recreated, link, export, save, views, drive, host_down,
+          [overview, signal, axes, slider, recreated, link, export, save, views, drive, host_down,
            reconnect, phone, recording]}
 
 

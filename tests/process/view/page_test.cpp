@@ -97,6 +97,15 @@ TEST_F(ViewPage, FollowsASignalAndHoldsIt) {
   });
 }
 
+TEST_F(ViewPage, AlignsPlotsOfAnyValues) {
+  auto motion = session_.create<Wheels>("motion", depth_of(100)).value();
+  for (int i = 0; i < 50; ++i) {
+    const auto x = static_cast<float>(i);
+    motion.write({1e10 + i, {1e-8F * x, 3e12F * x}, i}, at_ns(kSecond + i * 10'000'000));
+  }
+  expect_ok("axes", {kMotion, "x", "speed[0]", "speed[1]", "ticks"});
+}
+
 TEST_F(ViewPage, ShowsTheSamplesOfTheSlidersInstantAsDssmctlDoes) {
   constexpr int kSamples = 200;
   constexpr std::int64_t kCycle = 10'000'000;  // ns
