@@ -597,11 +597,11 @@ export class Signals extends EventTarget {
         const found = type && findField(type, signal.field);
         const value =
           sample?.payload && found ? valueOf(sample.payload, found.field, found.index) : undefined;
-        const text = value === undefined ? (sample?.status ?? "") : number(value);
-        setText(item.querySelector(".value"), text);
+        const reason = type && !found ? "no such field" : (sample?.status ?? "");
+        setText(item.querySelector(".value"), value === undefined ? reason : number(value));
         item.dataset.value = value === undefined ? "" : String(value);
         item.dataset.tid = sample?.tid ?? "";
-        setText(item.querySelector(".tid"), sample?.payload ? `#${sample.tid}` : "");
+        setText(item.querySelector(".tid"), sample?.payload && found ? `#${sample.tid}` : "");
       }
     }
   }

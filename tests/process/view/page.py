@@ -223,6 +223,8 @@ def axes(page, stream, *fields):
     def edges():
         return {(plot.rect["x"], plot.rect["width"]) for plot in page.all(".u-over")}
 
+    page.wait("that there is no such field", lambda: "no such field" in page.one(
+        f"[data-signal='{stream} none']").text)
     page.wait("room for the labels of large values", lambda: min(edges())[0] > 90)
     page.wait("the same edges", lambda: len(edges()) == 1)
     page.shot("axes")
