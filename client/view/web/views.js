@@ -243,8 +243,10 @@ class Card {
     }
   }
 
+  // What was chosen may not fit the type, which may have changed since.
   shownKind() {
-    return this.kind ?? (this.type ? guessKind(this.type) : "hex");
+    if (!this.type) return "hex";
+    return this.possibleKinds().includes(this.kind) ? this.kind : guessKind(this.type);
   }
 
   rebuild() {
@@ -260,8 +262,8 @@ class Card {
         .map((kind) => new Option(kKinds[kind], kind)),
     );
     if (this.kind === guessed) this.kind = null;
-    this.kindBox.value = this.kind ?? "";
     const kind = this.shownKind();
+    this.kindBox.value = kind === guessed ? "" : kind;
     this.element.dataset.kind = kind;
     this.showPlaces();
     const makers = {
@@ -355,18 +357,15 @@ class Card {
     if (kind === "scan" || kind === "pose") {
       const poseSample = samples.get(this.poseStream());
       const poseType = this.views.types.get(this.poseStream());
+      const fields = poseType && poseOf(poseType);
       const pose =
-        poseSample?.payload && poseType
-          ? this.drawing.readPose(poseSample.payload, poseOf(poseType))
-          : null;
+        poseSample?.payload && fields ? this.drawing.readPose(poseSample.payload, fields) : null;
       const scan =
         kind === "scan" ? this.drawing.readScan(sample.payload, scanOf(this.type)) : null;
       const missing = kind === "scan" && this.place && !pose;
-      note(
-        missing
-          ? `${this.place}: ${poseSample?.status ?? "no pose"}; the scan is not placed`
-          : (scan?.note ?? ""),
-      );
+      const reason =
+        poseType && !fields ? "its type has no fields of a pose" : (poseSample?.status ?? "no pose");
+      note(missing ? `${this.place}: ${reason}; the scan is not placed` : (scan?.note ?? ""));
       this.drawing.show({ scan, pose, trail: pose ? this.trailUntil(pose, poseSample) : null });
     } else {
       note("");

@@ -360,6 +360,11 @@ def views(page, scan, pose, image, raw):
     page.show_as(DESKTOP, "dark")
     page.wait("dark", lambda: page.run("return document.documentElement.dataset.theme") == "dark")
     page.shot("views-dark")
+    # Of a link to what has changed since: the scan without the place, and a kind that fits.
+    page.open("views", views=[{"stream": scan, "place": raw}, {"stream": pose, "kind": "scan"}])
+    page.wait("a scan that is not placed", lambda: f"{raw}: its type has no fields of a pose; "
+              "the scan is not placed" in page.one(card(scan)).text)
+    page.wait("a pose", lambda: page.get(card(pose), "data-kind") == "pose")
 
 
 def drive(page, scan, pose):
