@@ -255,7 +255,8 @@ async function step(count) {
 }
 let stepping = false;
 
-// The time of the sample before or after the one at `t`; null for none.
+// The time of the sample before or after the one at `t`, or nearest to `t` if there is none at `t`;
+// null for none.
 async function neighbour(stream, t, direction) {
   const at = async (ns) => {
     const answer = await connection.request("at", {
@@ -267,10 +268,15 @@ async function neighbour(stream, t, direction) {
     return sample.status === "ok" ? { tid: sample.tid, ns: BigInt(sample.time_ns) } : null;
   };
   const here = await at(t);
-  if (!here) return null;
+  const known = streams().find((one) => one.stream === stream);
+  if (!here) {
+    const end = direction < 0 ? known?.newest_ns : known?.oldest_ns;
+    const isThere = end && (direction < 0 ? BigInt(end) < t : BigInt(end) > t);
+    return isThere ? BigInt(end) : null;
+  }
   if (direction < 0) return (await at(here.ns - 1n))?.ns ?? null;
   // Ahead by a cycle, then by more; and back, should that skip samples.
-  const cycle = streams().find((one) => one.stream === stream)?.cycle_ns;
+  const cycle = known?.cycle_ns;
   let ahead = cycle > 0 ? BigInt(cycle) : 10000000n;
   let next = null;
   for (let i = 0; i < kMaxSteps && !next; ++i, ahead *= 2n) {

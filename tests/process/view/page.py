@@ -427,8 +427,9 @@ def phone(page, stream):
     assert page.run("return document.documentElement.scrollWidth") <= PHONE[0]
 
 
-def recording(page, stream, oldest_ns, newest_ns):
-    """A recording with `stream` begins held at its first sample, and plays to its last one."""
+def recording(page, stream, late, oldest_ns, newest_ns):
+    """A recording with `stream` begins held at its first sample, and plays to its last one; `late`
+    begins 1.2 s later, and has a sample each 0.1 s."""
     page.open("overview")
     row = page.wait(stream, lambda: page.one(stream_row(stream)))
     assert "recorded" in row.text, row.text
@@ -456,6 +457,12 @@ def recording(page, stream, oldest_ns, newest_ns):
     page.press(" ")
     page.wait("its end", lambda: page.get("#time", "data-mode") == "hold"
               and page.get("#time", "data-t-ns") == newest_ns)
+    page.open("views", views=[{"stream": late}])
+    page.wait("the first sample", lambda: page.get("#time", "data-t-ns") == oldest_ns)
+    for key, ms in [(Keys.ARROW_RIGHT, 1200), (Keys.ARROW_RIGHT, 1300), (Keys.ARROW_LEFT, 1200)]:
+        t = str(int(oldest_ns) + ms * 10**6)
+        page.press(key)
+        page.wait(f"a step to {ms} ms", lambda: page.get("#time", "data-t-ns") == t)
 
 
 CHECKS = {check.__name__: check for check in

@@ -25,7 +25,8 @@ Time after(std::int64_t ms) { return at_ns(kBeginNs + ms * kMs); }
 std::string ns_after(std::int64_t ms) { return std::to_string(kBeginNs + ms * kMs); }
 
 // Twenty seconds of a pose each 10 ms, whose owner restarted after ten; of the first half ten
-// samples were lost, and one of the second is a peak. And a counter each 100 ms of another host.
+// samples were lost, and one of the second is a peak. And of another host a counter each 100 ms,
+// and a switch that begins after 1.2 s.
 class ViewRecording : public testing::Test {
  protected:
   static constexpr std::int64_t kHalf = 1000;  // samples
@@ -38,6 +39,8 @@ class ViewRecording : public testing::Test {
     pose.incarnation = 2;
     const RecordedStream counter{{"counter", 3, "pc2"}, type_of<double>(), 64, {}, 1, {}, {}};
     const std::uint32_t counts = writer.add_stream(counter).value();
+    const RecordedStream late{{"switch", 0, "pc2"}, type_of<double>(), 64, {}, 1, {}, {}};
+    const std::uint32_t switches = writer.add_stream(late).value();
     std::uint32_t second = 0;
     for (std::int64_t i = 0; i < 2 * kHalf; ++i) {
       if (i == kHalf) second = writer.add_stream(pose).value();
@@ -46,6 +49,7 @@ class ViewRecording : public testing::Test {
         EXPECT_TRUE(writer.add_gap(first, tid, 10));
       }
       if (i % 10 == 0) write(writer, counts, i / 10 + 1, i * 10, static_cast<double>(i));
+      if (i % 10 == 0 && i >= 120) write(writer, switches, i / 10 - 11, i * 10, 1.0);
       if (i >= 500 && i < 510) continue;
       const double x = i == 1234 ? kPeak : static_cast<double>(i);
       write(writer, i < kHalf ? first : second, tid, i * 10, DrivenPose{x, 2, 3});
@@ -104,7 +108,7 @@ TEST_F(ViewRecording, IsListedWithItsStreams) {
   EXPECT_EQ(answer["recording"], Json({"drive.mcap"}));
   EXPECT_EQ(answer["range"]["oldest_ns"], ns_after(0));
   EXPECT_EQ(answer["range"]["newest_ns"], ns_after(20 * kHalf - 10));
-  ASSERT_EQ(answer["streams"].size(), 2U) << answer;
+  ASSERT_EQ(answer["streams"].size(), 3U) << answer;
   const Json& counter = answer["streams"][0];
   EXPECT_EQ(counter["stream"], "counter:3@pc2");
   EXPECT_NEAR(counter["rate_hz"].get<double>(), 10, 0.01);
@@ -174,9 +178,9 @@ TEST_F(ViewRecording, IsPlayedByFoxglovesPlaybackControl) {
 }
 
 TEST_F(ViewRecording, IsPlayedInTheBrowser) {
-  const Finished page =
-      run({"/usr/bin/python3", source("tests/process/view/page.py"), "recording", url_,
-           built("tests/process/view/page"), "pose:0@pc1", ns_after(0), ns_after(19'990)});
+  const Finished page = run({"/usr/bin/python3", source("tests/process/view/page.py"), "recording",
+                             url_, built("tests/process/view/page"), "pose:0@pc1", "switch:0@pc2",
+                             ns_after(0), ns_after(19'990)});
   EXPECT_EQ(page.exit_status, 0) << page.out << page.err;
 }
 
