@@ -366,7 +366,9 @@ class Card {
       const reason =
         poseType && !fields ? "its type has no fields of a pose" : (poseSample?.status ?? "no pose");
       note(missing ? `${this.place}: ${reason}; the scan is not placed` : (scan?.note ?? ""));
-      this.drawing.show({ scan, pose, trail: pose ? this.trailUntil(pose, poseSample) : null });
+      const trail = pose ? this.trailUntil(poseSample) : null;
+      this.element.dataset.trailPoints = String(trail?.x.length ?? 0);
+      this.drawing.show({ scan, pose, trail });
     } else {
       note("");
       this.drawing.show(sample, (text) => note(text));
@@ -420,13 +422,15 @@ class Card {
   // --- the trail ---------------------------------------------------------------------------------
 
   // The trail up to the shown pose.
-  trailUntil(pose, sample) {
+  trailUntil(sample) {
     if (!this.trail || this.trailS === 0) return null;
     const { from, times, x, y } = this.trail;
     const end = Number(sample.timeNs - from) / 1e9;
     let count = times.length;
     while (count > 0 && times[count - 1] > end) --count;
-    return { x: x.subarray(0, count), y: y.subarray(0, count) };
+    let first = 0; // an answer has a sample before its range, too
+    while (first < count && times[first] < end - this.trailS) ++first;
+    return { x: x.subarray(first, count), y: y.subarray(first, count) };
   }
 
   // Returns whether the stream is being opened.
@@ -459,7 +463,6 @@ class Card {
         answer.doubles(y.times_at, y.points),
         answer.doubles(y.values_at, y.points),
       );
-      this.element.dataset.trailPoints = String(x.points);
       if (this.samples) this.show(this.t, this.samples);
     } catch (error) {
       if (!(error instanceof RequestError)) throw error;

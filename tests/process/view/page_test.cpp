@@ -143,8 +143,9 @@ TEST_F(ViewPage, DrawsScansPosesImagesAndBytes) {
   auto scan = session_.create<PlanarScan>("scan", depth_of(8)).value();
   scan.write(wall);
   auto pose = session_.create<PlanarPose>("pose", depth_of(64)).value();
+  pose.write({9, 9, 0}, at_ns(kSecond));  // long before the trail
   for (int i = 0; i < 50; ++i)
-    pose.write({0.1 * i, 0.05 * i, 0.5}, at_ns(kSecond + i * 10'000'000));
+    pose.write({0.1 * i, 0.05 * i, 0.5}, at_ns(1000 * kSecond + i * 10'000'000));
   // The pixel at column x and row y is x + y.
   constexpr std::size_t kColumns = 160, kRows = 120;
   std::vector<std::byte> picture(kColumns * kRows);
