@@ -9,6 +9,7 @@ import { HexView, ImageView, PlaneView, PropertyView, TableView } from "./drawin
 
 const kSuggested = 6; // cards that are shown before a person has chosen
 const kKinds = { scan: "Scan", pose: "Pose", image: "Image", table: "Table", hex: "Hex", property: "Property" };
+const kAuto = "auto"; // a choice; streams have a host in their names
 const kTrailPeriodMs = 500;
 const kPropertyPeriodMs = 2000;
 const kOpeningMs = 100;
@@ -88,6 +89,11 @@ export class Views extends EventTarget {
 
   changed() {
     this.dispatchEvent(new Event("change"));
+    this.wake();
+  }
+
+  // Other streams are shown.
+  wake() {
     this.time.dispatchEvent(new Event("change"));
     this.pump.wake();
   }
@@ -141,7 +147,9 @@ class Card {
     this.views = views;
     this.stream = stream;
     this.kind = kind in kKinds ? kind : null; // null: what fits
-    this.place = typeof place === "string" ? place : null; // the stream of poses for a scan
+    // The stream of poses for a scan; "" for none, null for the one that fits.
+    this.chosenPlace = typeof place === "string" ? place : null;
+    this.fittingPlace = "";
     this.trailS = kTrailSpans.includes(trail) ? trail : kDefaultTrail;
     this.trail = null;
     this.propertyAt = -Infinity; // when it was asked for
@@ -152,7 +160,7 @@ class Card {
   get state() {
     const state = { stream: this.stream };
     if (this.kind) state.kind = this.kind;
-    if (this.place) state.place = this.place;
+    if (this.chosenPlace !== null) state.place = this.chosenPlace;
     if (this.trailS !== kDefaultTrail) state.trail = this.trailS;
     return state;
   }
@@ -172,8 +180,10 @@ class Card {
       },
     });
     this.placeBox = element("select", {
+      "aria-label": `Pose that places ${this.stream}`,
       onchange: () => {
-        this.place = this.placeBox.value || null;
+        const { value } = this.placeBox;
+        this.chosenPlace = value === kAuto ? null : value;
         changed();
       },
     });
@@ -229,6 +239,10 @@ class Card {
     );
   }
 
+  get place() {
+    return this.chosenPlace ?? this.fittingPlace;
+  }
+
   // Asks for the types that it needs, then builds the drawing.
   async prepare() {
     const type = await this.views.types.ask(this.stream);
@@ -239,7 +253,9 @@ class Card {
     }
     if (type && scanOf(type)) {
       for (const stream of this.views.streams()) await this.views.types.ask(stream.stream);
+      const before = this.place;
       this.showPlaces();
+      if (this.place !== before) this.views.wake();
     }
   }
 
@@ -277,8 +293,6 @@ class Card {
     this.body.replaceChildren();
     this.drawing = makers[kind]();
     if (kind === "property") this.views.pump.wake();
-    this.trailLabel.hidden = !this.poseStream();
-    this.placeLabel.hidden = kind !== "scan" || this.placeBox.options.length < 2;
     if (this.samples) this.show(this.t, this.samples);
   }
 
@@ -300,19 +314,30 @@ class Card {
         const type = this.views.types.get(stream);
         return type && poseOf(type)?.theta;
       });
+    this.fittingPlace = this.fittingOf(poses);
     if (this.place && !poses.includes(this.place)) poses.push(this.place);
     this.placeBox.replaceChildren(
+      new Option(`Auto: ${this.fittingPlace || "nothing"}`, kAuto),
       new Option("nothing", ""),
       ...poses.map((name) => new Option(name, name)),
     );
-    this.placeBox.value = this.place ?? "";
+    this.placeBox.value = this.chosenPlace ?? kAuto;
     this.placeLabel.hidden = this.shownKind() !== "scan" || poses.length === 0;
+    this.trailLabel.hidden = !this.poseStream();
+  }
+
+  // The only stream of poses of the scan's host, else the only one of all.
+  fittingOf(poses) {
+    const hostOf = (stream) => stream.slice(stream.lastIndexOf("@"));
+    const near = poses.filter((stream) => hostOf(stream) === hostOf(this.stream));
+    const candidates = near.length > 0 ? near : poses;
+    return candidates.length === 1 ? candidates[0] : "";
   }
 
   // The stream of poses that this card draws; null for none.
   poseStream() {
     const kind = this.shownKind();
-    return kind === "pose" ? this.stream : kind === "scan" ? this.place : null;
+    return kind === "pose" ? this.stream : kind === "scan" ? this.place || null : null;
   }
 
   chosenStreams() {

@@ -355,6 +355,17 @@ def views(page, scan, pose, image, raw):
         page.wait(f"{stream} is drawn", lambda: page.run(drawn, page.one(card(stream) + " canvas")))
     page.wait("bytes", lambda: "000000  de ad be ef" in page.one(card(raw)).text)
     page.shot("views-light")
+    # The only pose places the scan, as long as a person does not choose otherwise.
+    place = f"{card(scan)} select[aria-label^='Pose']"
+    page.wait("the place", lambda: f"Auto: {pose}" in page.one(place).text)
+    page.wait("its trail", lambda: page.get(card(scan), "data-trail-points") == "50")
+    page.one(place).send_keys("nothing")
+    page.wait("the choice in the link", lambda: urllib.parse.quote('"place":""')
+              in page.driver.current_url)
+    page.wait("no trail", lambda: page.get(card(scan), "data-trail-points") == "0")
+    page.driver.refresh()
+    page.await_connected()
+    page.wait("still nothing", lambda: page.get(place, "value") == "")
     page.one(f"{card(scan)} select[aria-label^='Kind']").send_keys("Table")
     page.wait("all fields", lambda: "first_rad" in page.one(card(scan)).text)
     page.show_as(DESKTOP, "dark")
