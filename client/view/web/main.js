@@ -90,10 +90,30 @@ function streams() {
   return overview?.streams ?? [];
 }
 
+// "host pc2 is down"; empty for a host that answers.
+function outageOf(stream) {
+  const name = stream.slice(stream.lastIndexOf("@") + 1);
+  const state = overview?.hosts.find((host) => host.host === name)?.state ?? "up";
+  return state === "up" || state === "self" ? "" : `host ${name} is ${state}`;
+}
+
+// Why the newest sample of a stream is old; empty if it need not be.
+function stalenessOf(stream) {
+  const state = streams().find((one) => one.stream === stream)?.state;
+  return outageOf(stream) || (state === "stalled" || state === "no writer" ? state : "");
+}
+
+// What people read where there is no sample with that status.
+function textOf(stream, status) {
+  const outage = outageOf(stream);
+  if (outage && (status === "arriving" || status === "not_yet")) return outage;
+  return status.replaceAll("_", " ");
+}
+
 // --- the pages -----------------------------------------------------------------------------------
 
 const types = new Types();
-const parts = { connection, time, types, streams };
+const parts = { connection, time, types, streams, textOf };
 const signals = new Signals(find("signals"), parts);
 const views = new Views(find("views"), parts);
 const overviewPage = new Overview(find("overview"), (stream) => {
@@ -215,7 +235,9 @@ function sampleOf(one, answer) {
   const has = one.payload_at !== undefined && one.payload_at !== null;
   return {
     status: one.status.replaceAll("_", " "),
+    text: textOf(one.stream, one.status),
     error: one.error ?? "",
+    staleness: time.instant() === null ? stalenessOf(one.stream) : "",
     tid: one.tid ?? null,
     timeNs: one.time_ns === undefined || one.time_ns === null ? null : BigInt(one.time_ns),
     clockErrorNs:
@@ -227,7 +249,8 @@ function sampleOf(one, answer) {
 }
 
 function failed(error) {
-  return { status: "failed", error, tid: null, timeNs: null, clockErrorNs: null, payload: null };
+  const none = { tid: null, timeNs: null, clockErrorNs: null, payload: null };
+  return { status: "failed", text: "failed", error, staleness: "", ...none };
 }
 
 // --- steps by samples ----------------------------------------------------------------------------

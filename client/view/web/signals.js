@@ -41,9 +41,10 @@ export const nameOf = (signal) => `${signal.stream} ${signal.field}`;
 // Dispatches "change" when what is chosen has changed.
 export class Signals extends EventTarget {
   // types: the known types of streams; streams: returns those of the last overview
-  constructor(root, { connection, time, types, streams }) {
+  // textOf: of a stream and a status, for people
+  constructor(root, { connection, time, types, streams, textOf }) {
     super();
-    Object.assign(this, { root, connection, time, types, streams });
+    Object.assign(this, { root, connection, time, types, streams, textOf });
     this.panels = []; // {signals, element, legend, plot}
     this.span = kDefaultSpan;
     this.zoom = null; // {from, to}
@@ -248,6 +249,7 @@ export class Signals extends EventTarget {
           ),
           element("span", { class: "value" }),
           element("span", { class: "tid", title: "tid" }),
+          element("span", { class: "stale" }),
           element(
             "button",
             {
@@ -565,7 +567,7 @@ export class Signals extends EventTarget {
       const isUsual = ["ok", "too_old", "not_yet"].includes(answer.status);
       const isEmpty = [...answer.curves.values()].every((curve) => !this.isInWindow(answer, curve));
       if (answer.error) notes.push(answer.error);
-      else if (!isUsual) notes.push(`${stream}: ${answer.status.replaceAll("_", " ")}`);
+      else if (!isUsual) notes.push(`${stream}: ${this.textOf(stream, answer.status)}`);
       else if (isEmpty) notes.push(`${stream}: no samples in this window`);
       if (answer.lost > 0) notes.push(`${stream}: ${answer.lost} samples lost in this window`);
       if (answer.leftOut > 0) {
@@ -597,8 +599,9 @@ export class Signals extends EventTarget {
         const found = type && findField(type, signal.field);
         const value =
           sample?.payload && found ? valueOf(sample.payload, found.field, found.index) : undefined;
-        const reason = type && !found ? "no such field" : (sample?.status ?? "");
+        const reason = type && !found ? "no such field" : (sample?.text ?? "");
         setText(item.querySelector(".value"), value === undefined ? reason : number(value));
+        setText(item.querySelector(".stale"), sample?.staleness ?? "");
         item.dataset.value = value === undefined ? "" : String(value);
         item.dataset.tid = sample?.tid ?? "";
         setText(item.querySelector(".tid"), sample?.payload && found ? `#${sample.tid}` : "");

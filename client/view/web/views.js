@@ -203,7 +203,7 @@ class Card {
     this.body = element("div", { class: "drawing" });
     this.note = element("p", { class: "status", role: "status" });
     this.foot = {};
-    for (const key of ["tid", "time", "age", "error"])
+    for (const key of ["tid", "time", "age", "error", "stale"])
       this.foot[key] = element("span", { class: key });
     this.foot.error.title = "Bound on the error of the sample's time";
     this.element = element(
@@ -352,6 +352,7 @@ class Card {
     const sample = samples.get(this.stream);
     if (!sample) return;
     this.element.dataset.status = sample.status;
+    this.element.dataset.stale = sample.staleness;
     this.showFoot(t, sample);
     if (!sample.payload) return;
     // What a JPEG is, its type need not say.
@@ -389,7 +390,7 @@ class Card {
         kind === "scan" ? this.drawing.readScan(sample.payload, scanOf(this.type)) : null;
       const missing = kind === "scan" && this.place && !pose;
       const reason =
-        poseType && !fields ? "its type has no fields of a pose" : (poseSample?.status ?? "no pose");
+        poseType && !fields ? "its type has no fields of a pose" : (poseSample?.text ?? "no pose");
       note(missing ? `${this.place}: ${reason}; the scan is not placed` : (scan?.note ?? ""));
       const trail = pose ? this.trailUntil(poseSample) : null;
       this.element.dataset.trailPoints = String(trail?.x.length ?? 0);
@@ -405,8 +406,9 @@ class Card {
     this.element.dataset.tid = sample.tid ?? "";
     this.element.dataset.timeNs = sample.timeNs === null ? "" : String(sample.timeNs);
     const none = sample.status !== "ok" && !sample.payload;
-    if (none) setText(this.note, sample.error || sample.status);
-    setText(foot.tid, sample.tid === null ? sample.status : `tid ${sample.tid}`);
+    if (none) setText(this.note, sample.error || sample.text);
+    setText(foot.stale, sample.staleness);
+    setText(foot.tid, sample.tid === null ? "" : `tid ${sample.tid}`);
     setText(foot.time, sample.timeNs === null ? "" : timeOfDay(sample.timeNs));
     const age = sample.timeNs === null ? 0n : t - sample.timeNs;
     const distance = duration(age < 0n ? -age : age);

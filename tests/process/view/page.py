@@ -395,12 +395,18 @@ def drive(page, scan, pose):
     page.shot("drive")
 
 
-def host_down(page, host):
-    """Prints "ready" when `host` is up, and ends when the page shows that it is down."""
-    page.open("overview")
-    row = f"#hosts tr[data-host='{host}']"
-    page.wait("up", lambda: page.get(row, "data-state") == "up")
+def host_down(page, host, stream):
+    """Prints "ready" when `host` with `stream` is up, and ends when all pages show that it is down."""
+    page.open("views", views=[{"stream": stream}], signals={"panels": [[[stream, "watts"]]]})
+    page.wait("a sample", lambda: page.get(card(stream), "data-tid"))
     say("ready")
+    mark = f"host {host} is down"
+    page.wait("it in the view", lambda: mark in page.one(card(stream)).text)
+    page.shot("host-down-views")
+    page.press("2")
+    page.wait("it in the legend", lambda: mark in page.one(".legend").text)
+    page.press("1")
+    row = f"#hosts tr[data-host='{host}']"
     page.wait("down", lambda: page.get(row, "data-state") == "down")
     page.wait("the event", lambda: f"host {host} is down" in page.one("#events").text)
     page.shot("host-down")

@@ -244,7 +244,10 @@ TEST_F(ViewPage, ShowsTheDriveOfTheExample) {
 }
 
 TEST_F(ViewPage, ShowsThatAHostIsDown) {
-  Running page(page_argv("host_down", {"pc2"}), {});
+  auto lamp = on_pc2_.create<Lamp>("lamp", depth_of(8)).value();
+  lamp.write({40, 1});
+  await_streams(1);
+  Running page(page_argv("host_down", {"pc2", "lamp:0@pc2"}), {});
   ASSERT_EQ(page.line(), "ready") << page.rest();
   pc2_.kill_hard();
   lines(page, [] {});
