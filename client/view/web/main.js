@@ -3,7 +3,7 @@
 // The page of dssm-view. This file connects its parts: the connection, the shown instant, the three
 // pages, the keys, and the state in the URL's fragment.
 import { Connection, LostError, Pump, RequestError } from "./connection.js";
-import { setText, timeOfDay } from "./format.js";
+import { duration, setText, timeOfDay } from "./format.js";
 import { Overview } from "./overview.js";
 import { SaveDialog } from "./save.js";
 import { Signals } from "./signals.js";
@@ -105,8 +105,13 @@ function stalenessOf(stream) {
 
 // What people read where there is no sample with that status.
 function textOf(stream, status) {
+  const t = time.instant();
+  const oldest = streams().find((one) => one.stream === stream)?.oldest_ns;
   const outage = outageOf(stream);
   if (outage && (status === "arriving" || status === "not_yet")) return outage;
+  if (status === "too_old" && t !== null && oldest && BigInt(oldest) > t) {
+    return `${time.recorded ? "begins" : "the ring begins"} ${duration(BigInt(oldest) - t)} later`;
+  }
   return status.replaceAll("_", " ");
 }
 

@@ -476,6 +476,8 @@ def recording(page, stream, late, oldest_ns, newest_ns):
               and page.get("#time", "data-t-ns") == newest_ns)
     page.open("views", views=[{"stream": late}])
     page.wait("the first sample", lambda: page.get("#time", "data-t-ns") == oldest_ns)
+    page.wait("when it begins", lambda: page.one(card(late)).text.count("begins 1.20 s later") == 1)
+    assert "too old" not in page.one(card(late)).text
     for key, ms in [(Keys.ARROW_RIGHT, 1200), (Keys.ARROW_RIGHT, 1300), (Keys.ARROW_LEFT, 1200)]:
         t = str(int(oldest_ns) + ms * 10**6)
         page.press(key)
