@@ -117,14 +117,15 @@ export class Signals extends EventTarget {
     }
   }
 
-  // Until a person has chosen: a panel with a few fields of each of the first streams.
+  // Until a person has chosen: a panel with a few fields of each of the first streams, of live ones
+  // before others, and of arrays last.
   async suggest() {
     if (this.panels.length > 0) this.suggested = true;
     if (this.suggested || this.streams().length === 0) return;
     this.suggested = true;
     const known = [];
     let isAnyMissing = false;
-    for (const { stream } of this.streams()) {
+    for (const { stream, state } of this.streams()) {
       const type = await this.types.ask(stream);
       isAnyMissing ||= !type;
       const names = type
@@ -132,14 +133,14 @@ export class Signals extends EventTarget {
             .filter((one) => !one.count)
             .slice(0, kFewFields)
         : [];
-      if (names.length > 0)
-        known.push({ stream, names, isArray: ["scan", "image"].includes(guessKind(type)) });
+      const isArray = type && ["scan", "image"].includes(guessKind(type));
+      if (names.length > 0) known.push({ stream, names, order: 2 * (state !== "live") + isArray });
     }
     if (known.length === 0 && isAnyMissing) {
       this.suggested = false; // again, with the next overview
       return;
     }
-    known.sort((a, b) => Number(a.isArray) - Number(b.isArray));
+    known.sort((a, b) => a.order - b.order);
     for (const { stream, names } of known.slice(0, kFewPanels)) {
       this.addPanel(names.map(({ name }) => ({ stream, field: name })));
     }

@@ -199,6 +199,10 @@ def signal(page, stream, field):
     page.wait("dark", lambda: page.run("return document.documentElement.dataset.theme") == "dark")
     page.shot("signals-dark")
     check_pressed(page, "dark")
+    page.open("signals")
+    page.wait("suggested panels", lambda: page.all(".legend"))
+    names = [item.get_attribute("data-signal") for item in page.all(".legend li")]
+    assert names[0].startswith(stream), f"{names} are suggested before the live stream"
 
 
 def check_pressed(page, scheme):

@@ -87,6 +87,9 @@ TEST_F(ViewPage, ShowsHostsStreamsAndProgramsWhateverTheirNamesAre) {
 }
 
 TEST_F(ViewPage, FollowsASignalAndHoldsIt) {
+  for (const char* ended : {"a", "b"}) {
+    session_.create<Lamp>(ended, depth_of(8)).value().write({40, 1});
+  }
   auto motion = session_.create<Wheels>("motion", depth_of(1000)).value();
   int ticks = 0;
   Running page(page_argv("signal", {kMotion, "x"}), {});
