@@ -165,7 +165,7 @@ export class Signals extends EventTarget {
   // --- panels ------------------------------------------------------------------------------------
 
   addPanel(signals, choose = false) {
-    const panel = { signals: [...signals], plot: null };
+    const panel = { signals: [...signals], plot: null, pointerPx: null };
     panel.legend = element("ul", { class: "legend" });
     panel.plotBox = element("div", { class: "plot" });
     panel.note = element("p", { class: "status", role: "status" });
@@ -314,7 +314,7 @@ export class Signals extends EventTarget {
       },
       series: [{}, ...series],
       // The place of the cursor is known when the plot has its new scale.
-      hooks: { setSelect: [(plot) => this.onSelect(plot)], draw: [() => this.drawCursorIn(panel)] },
+      hooks: { setSelect: [(plot) => this.onSelect(plot)], draw: [() => this.onDraw(panel)] },
     };
     panel.line = null; // the new plot draws at once
     panel.plot = new uPlot(options, [[], ...panel.signals.map(() => [])], panel.plotBox);
@@ -347,19 +347,35 @@ export class Signals extends EventTarget {
   listen(panel) {
     const { over } = panel.plot;
     let pressedAt = 0;
-    const timeAt = (event) =>
-      this.toTime(panel.plot.posToVal(event.clientX - over.getBoundingClientRect().left, "x"));
-    over.addEventListener(
-      "mousemove",
-      (event) => this.epoch !== null && this.time.setHover(timeAt(event)),
-    );
-    over.addEventListener("mouseleave", () => this.time.setHover(null));
+    const moveTo = (event) => {
+      panel.pointerPx = event.clientX - over.getBoundingClientRect().left;
+      this.time.setHover(this.timeAt(panel));
+    };
+    over.addEventListener("mousemove", (event) => this.epoch !== null && moveTo(event));
+    over.addEventListener("mouseleave", () => {
+      panel.pointerPx = null;
+      this.time.setHover(null);
+    });
     over.addEventListener("mousedown", (event) => (pressedAt = event.clientX));
     over.addEventListener("click", (event) => {
       if (this.epoch === null || Math.abs(event.clientX - pressedAt) >= kDragPx) return;
-      this.time.hold(timeAt(event));
+      moveTo(event);
+      this.time.hold();
     });
     over.addEventListener("dblclick", () => this.resetZoom());
+  }
+
+  // Below the pointer.
+  timeAt(panel) {
+    return this.toTime(panel.plot.posToVal(panel.pointerPx, "x"));
+  }
+
+  // Where the curves move, so does the time below the pointer.
+  onDraw(panel) {
+    if (this.time.hover !== null && panel.pointerPx !== null) {
+      this.time.setHover(this.timeAt(panel));
+    }
+    this.drawCursorIn(panel);
   }
 
   plotSize() {

@@ -195,6 +195,24 @@ def signal(page, stream, field):
             page.wait(f"{mode} by Space after a click on {button}",
                       lambda: page.get("#time", "data-mode") == mode)
     check_pressed(page, "light")
+    # The cursor stays at the pointer while the curve moves, and a click holds the time that it has.
+    plot = page.one(".u-over")
+    ActionChains(page.driver).move_to_element(plot).perform()
+    pointer = plot.rect["x"] + int(plot.rect["width"] / 2)
+    place = ("return [document.querySelector('.cursor-line').getBoundingClientRect().left,"
+             " document.querySelector('#shown-t').dataset.tNs]")
+    first = page.wait("the cursor", lambda: page.one(".cursor-line").is_displayed()
+                      and page.run(place)[1])
+    left, last = page.wait("later values", lambda: int(page.run(place)[1]) > int(first) + 10**9
+                           and page.run(place))
+    assert abs(left - pointer) < 3, f"the cursor is at {left}, the pointer at {pointer}"
+    ActionChains(page.driver).click().perform()
+    page.wait("held", lambda: page.get("#time", "data-mode") == "hold")
+    held = page.get("#time", "data-t-ns")
+    assert int(held) >= int(last), f"a click holds {held}, but {last} was shown"
+    page.wait("it is shown", lambda: page.run(place)[1] == held)
+    assert abs(page.run(place)[0] - pointer) < 3
+    page.press("l")
     page.show_as(DESKTOP, "dark")
     page.wait("dark", lambda: page.run("return document.documentElement.dataset.theme") == "dark")
     page.shot("signals-dark")
