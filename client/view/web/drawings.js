@@ -21,6 +21,7 @@ export class PlaneView {
     this.center = [0, 0]; // m
     this.scale = null; // CSS pixels per m; null: it fits at the next drawing
     this.fitted = true; // until a person zooms or moves
+    this.pointers = new Map(); // that are down: id -> [x, y] in CSS pixels
     this.observer = new ResizeObserver(() => this.resize());
     this.observer.observe(this.canvas);
     this.listen();
@@ -37,33 +38,59 @@ export class PlaneView {
       (event) => {
         event.preventDefault();
         if (this.scale === null) return;
-        const factor = kWheelStep ** -event.deltaY;
-        const scale = Math.min(kMaxScale, Math.max(kMinScale, this.scale * factor));
-        const [u, v] = [
-          event.offsetX - canvas.clientWidth / 2,
-          canvas.clientHeight / 2 - event.offsetY,
-        ];
-        this.center[0] += u / this.scale - u / scale;
-        this.center[1] += v / this.scale - v / scale;
-        this.scale = scale;
-        this.fitted = false;
-        this.redraw();
+        this.zoom(kWheelStep ** -event.deltaY, event.offsetX, event.offsetY);
       },
       { passive: false },
     );
-    canvas.addEventListener("pointerdown", (event) => canvas.setPointerCapture(event.pointerId));
-    canvas.addEventListener("pointermove", (event) => {
-      if (!canvas.hasPointerCapture(event.pointerId) || this.scale === null) return;
-      this.center[0] -= event.movementX / this.scale;
-      this.center[1] += event.movementY / this.scale;
-      this.fitted = false;
+    canvas.addEventListener("pointerdown", (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      const { center, scale, fitted } = this;
+      if (this.pointers.size === 0) this.before = { center: [...center], scale, fitted };
+      this.pointers.set(event.pointerId, [event.offsetX, event.offsetY]);
+    });
+    canvas.addEventListener("pointercancel", () => {
+      Object.assign(this, this.before); // the finger scrolls the page instead
       this.redraw();
     });
+    canvas.addEventListener("lostpointercapture", (event) =>
+      this.pointers.delete(event.pointerId),
+    );
+    canvas.addEventListener("pointermove", (event) => this.movePointer(event));
     canvas.addEventListener("dblclick", () => {
       this.fitted = true;
       this.scale = null;
       this.redraw();
     });
+  }
+
+  // One pointer moves the plane, two zoom it.
+  movePointer({ pointerId, offsetX, offsetY }) {
+    if (!this.pointers.has(pointerId) || this.scale === null) return;
+    const before = this.pinch();
+    this.pointers.set(pointerId, [offsetX, offsetY]);
+    const after = this.pinch();
+    this.center[0] -= (after.x - before.x) / this.scale;
+    this.center[1] += (after.y - before.y) / this.scale;
+    const isPinch = before.size > 0 && after.size > 0;
+    this.zoom(isPinch ? after.size / before.size : 1, after.x, after.y);
+  }
+
+  // The middle of the first two pointers, and how far they are from each other.
+  pinch() {
+    const [[x0, y0], [x1, y1] = [x0, y0]] = this.pointers.values();
+    return { x: (x0 + x1) / 2, y: (y0 + y1) / 2, size: Math.hypot(x1 - x0, y1 - y0) };
+  }
+
+  // What is at (x, y) of the canvas remains there.
+  zoom(factor, x, y) {
+    const { canvas } = this;
+    const scale = Math.min(kMaxScale, Math.max(kMinScale, this.scale * factor));
+    const [u, v] = [x - canvas.clientWidth / 2, canvas.clientHeight / 2 - y];
+    this.center[0] += u / this.scale - u / scale;
+    this.center[1] += v / this.scale - v / scale;
+    this.scale = scale;
+    this.fitted = false;
+    this.redraw();
   }
 
   readPose(payload, fields) {

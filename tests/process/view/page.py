@@ -394,10 +394,50 @@ def views(page, scan, pose, image, raw):
     page.wait("dark", lambda: page.run("return document.documentElement.dataset.theme") == "dark")
     page.shot("views-dark")
     # Of a link to what has changed since: the scan without the place, and a kind that fits.
-    page.open("views", views=[{"stream": scan, "place": raw}, {"stream": pose, "kind": "scan"}])
+    page.open("views", views=[{"stream": scan, "place": raw}, {"stream": pose, "kind": "scan"},
+                              {"stream": image}])
     page.wait("a scan that is not placed", lambda: f"{raw}: its type has no fields of a pose; "
               "the scan is not placed" in page.one(card(scan)).text)
     page.wait("a pose", lambda: page.get(card(pose), "data-kind") == "pose")
+    check_touch(page, pose)
+
+
+def check_touch(page, stream):
+    """On the plan view of `stream`, a finger scrolls the page, and two zoom the view."""
+    page.show_as(PHONE, "light")
+    page.driver.execute_cdp_cmd("Emulation.setTouchEmulationEnabled",
+                                {"enabled": True, "maxTouchPoints": 2})
+    page.driver.refresh()
+    page.await_connected()
+    page.wait("a sample", lambda: page.get(card(stream), "data-tid"))
+    page.press(" ")
+    settled(page, [stream])
+    canvas = card(stream) + " canvas"
+
+    def touch(kind, *points):
+        page.driver.execute_cdp_cmd("Input.dispatchTouchEvent", {
+            "type": kind, "touchPoints": [
+                {"id": i, "x": x, "y": y} for i, (x, y) in enumerate(points)]})
+
+    def swipe(*ways):
+        """Moves a finger in each of these directions, away from the middle of the view."""
+        x, y = page.run("const {left, top, width, height} = arguments[0].getBoundingClientRect();"
+                        "return [left + width / 2, top + height / 2]", page.one(canvas))
+        for px in range(20, 120, 10):
+            points = [(x + u * px, y + v * px) for u, v in ways]
+            touch("touchStart" if px == 20 else "touchMove", *points)
+        touch("touchEnd")
+
+    picture = "return arguments[0].toDataURL()"
+    page.run("arguments[0].scrollIntoView({block: 'center'})", page.one(canvas))
+    before, top = page.run(picture, page.one(canvas)), page.run("return scrollY")
+    swipe((0, 1))
+    page.wait("the page scrolls", lambda: page.run("return scrollY") < top - 40)
+    assert page.run(picture, page.one(canvas)) == before, "the view moves with the page"
+    swipe((1, 0), (-1, 0))
+    page.wait("the view zooms", lambda: page.run(picture, page.one(canvas)) != before)
+    assert page.run("return visualViewport.scale") == 1, "the page zooms with the view"
+    page.shot("views-touch")
 
 
 def drive(page, scan, pose):
