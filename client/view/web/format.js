@@ -3,6 +3,9 @@
 // Text for people, and elements of the page. Names of streams, programs and hosts come from other
 // computers: they become text nodes and attributes, never markup.
 
+export const kClockErrorHint =
+  "How far the time of a sample may be from this PC's clock; in a recording, from the recorder's";
+
 // An element with attributes and children (elements, or strings that become text).
 export function element(tag, attributes = {}, ...children) {
   const made = document.createElement(tag);

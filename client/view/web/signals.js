@@ -11,6 +11,7 @@ import {
   download,
   duration,
   element,
+  kClockErrorHint,
   number,
   setText,
   timeOfDay,
@@ -322,7 +323,7 @@ export class Signals extends EventTarget {
     panel.line = element(
       "div",
       { class: "cursor-line", hidden: true },
-      element("span", { title: "Bound on the error of the samples' times" }),
+      element("span", { title: kClockErrorHint }),
     );
     panel.plot.over.append(panel.band, panel.line);
     this.listen(panel);

@@ -4,7 +4,7 @@
 // the kind of view that a person chose or that fits the type.
 import { Pump, RequestError } from "./connection.js";
 import { guessKind, imageOf, poseOf, scanOf } from "./fields.js";
-import { duration, element, setText, timeOfDay, wholeDuration } from "./format.js";
+import { duration, element, kClockErrorHint, setText, timeOfDay, wholeDuration } from "./format.js";
 import { HexView, ImageView, PlaneView, PropertyView, TableView } from "./drawings.js";
 
 const kSuggested = 6; // cards that are shown before a person has chosen
@@ -205,7 +205,7 @@ class Card {
     this.foot = {};
     for (const key of ["tid", "time", "age", "error", "stale"])
       this.foot[key] = element("span", { class: key });
-    this.foot.error.title = "Bound on the error of the sample's time";
+    this.foot.error.title = kClockErrorHint;
     this.element = element(
       "article",
       { class: "card", tabindex: "0", "data-stream": this.stream, "aria-label": this.stream },
