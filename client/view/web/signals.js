@@ -8,6 +8,7 @@ import { findField, guessKind, isFloat, signalsOf, valueOf } from "./fields.js";
 import {
   axisLabels,
   cssColor,
+  day,
   download,
   duration,
   element,
@@ -704,17 +705,18 @@ export class Signals extends EventTarget {
     return answer;
   }
 
-  // The panels below each other, with their legends.
+  // The time of the values, and the panels below each other with their legends.
   async exportPng() {
     const panels = this.panels.filter((panel) => panel.plot);
     if (panels.length === 0) return;
     const ratio = devicePixelRatio;
     const legendHeight = 22;
+    const titleHeight = 8 + legendHeight;
     const width = Math.max(...panels.map((panel) => panel.plot.width));
     const heights = panels.map((panel) => panel.plot.height + legendHeight + 8);
     const canvas = element("canvas", {
       width: Math.round(width * ratio),
-      height: Math.round(heights.reduce((a, b) => a + b, 8) * ratio),
+      height: Math.round(heights.reduce((a, b) => a + b, titleHeight) * ratio),
     });
     const draw = canvas.getContext("2d");
     draw.scale(ratio, ratio);
@@ -722,7 +724,9 @@ export class Signals extends EventTarget {
     draw.fillRect(0, 0, width, canvas.height);
     draw.font = "12px system-ui, sans-serif";
     draw.textBaseline = "middle";
-    let top = 8;
+    draw.fillStyle = cssColor("--text-2");
+    draw.fillText(this.shownTime(), 12, titleHeight / 2);
+    let top = titleHeight;
     for (const [k, panel] of panels.entries()) {
       let left = 12;
       for (const [i, signal] of panel.signals.entries()) {
@@ -745,6 +749,12 @@ export class Signals extends EventTarget {
     }
     const blob = await new Promise((resolve) => canvas.toBlob(resolve, "image/png"));
     download(blob, this.fileName("png"));
+  }
+
+  // Of the values in the legends.
+  shownTime() {
+    const { shown } = this.time;
+    return shown === null ? "" : `${day(shown)} ${timeOfDay(shown)}`;
   }
 
   fileName(ending) {

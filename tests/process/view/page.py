@@ -334,6 +334,9 @@ def export(page, stream, *fields):
     page.wait("all samples", lambda: int(page.get(".panel", "data-points") or 0) >= 100)
     page.press(" ")
     page.wait("held", lambda: page.get("#time", "data-mode") == "hold")
+    page.run("window.texts = []; const {prototype} = CanvasRenderingContext2D;"
+             "const {fillText} = prototype; prototype.fillText = function (text, ...place)"
+             " { window.texts.push(text); fillText.call(this, text, ...place); }")
     for ending in ["csv", "png"]:
         for old in glob.glob(os.path.join(page.folder, "dssm-signals-*." + ending)):
             os.remove(old)
@@ -341,6 +344,9 @@ def export(page, stream, *fields):
         found = page.wait("the file", lambda: glob.glob(
             os.path.join(page.folder, "dssm-signals-*." + ending)))
         say(ending, *found)
+    shown = page.one("#shown-t").text.split()[0]
+    texts = page.run("return window.texts")
+    assert any(text.endswith(" " + shown) for text in texts), f"no {shown} in the picture: {texts}"
 
 
 def save(page, stream):
