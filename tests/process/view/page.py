@@ -97,7 +97,8 @@ class Page:
                 return result
             time.sleep(POLL_S)
         self.shot("failed")
-        raise AssertionError(f"not so within {TIMEOUT_S} s: {what}\n{self.one('body').text}")
+        text = self.one("body").text.replace("\n", "\n  ")  # no line is the "ok" of the end
+        raise AssertionError(f"not so within {TIMEOUT_S} s: {what}\n  {text}")
 
     def shot(self, name):
         assert self.driver.save_screenshot(os.path.join(self.folder, name + ".png"))
