@@ -34,9 +34,13 @@ class Probe {
 // Where t lies between the two ends, as if the times between them were evenly spaced.
 Tid interpolate(Tid low, Tid high, std::int64_t low_ns, std::int64_t high_ns,
                 std::int64_t t_ns) noexcept {
-  // Differences as doubles: they may be as wide as the whole range of int64.
-  const double share = (static_cast<double>(t_ns) - static_cast<double>(low_ns)) /
-                       (static_cast<double>(high_ns) - static_cast<double>(low_ns));
+  // Differences may be as wide as the whole range of int64. Those of doubles would be too coarse:
+  // the times of today are 256 ns apart there.
+  const auto after_low = [low_ns](std::int64_t time_ns) {
+    return static_cast<double>(static_cast<std::uint64_t>(time_ns) -
+                               static_cast<std::uint64_t>(low_ns));
+  };
+  const double share = after_low(t_ns) / after_low(high_ns);
   const Tid guess = low + static_cast<Tid>(share * static_cast<double>(high - low));
   return std::clamp(guess, low, high - 1);
 }
