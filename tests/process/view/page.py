@@ -462,6 +462,9 @@ def drive(page, scan, pose):
     for stream in [scan, pose]:
         page.wait("the trail", lambda: int(page.get(card(stream), "data-trail-points") or 0) > 50)
     page.shot("drive")
+    page.show_as((940, 600), "light")
+    titles = page.run("return [...document.querySelectorAll('.card h3')].map((h) => h.clientWidth)")
+    assert min(titles) > 30, f"a card has no title: {titles}"
 
 
 def host_down(page, host, stream):
