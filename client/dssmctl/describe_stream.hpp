@@ -29,8 +29,8 @@ Result<ProgramType> type_of_programs(Session& session, const StreamInfo& stream,
 // the user's own.
 std::optional<ProgramType> obvious_type_of_programs(Session& session, const StreamId& id);
 
-// The same for a verb that shows samples of the reader's stream: of one that is not described, and
-// with a word to the user.
+// The same for a verb that shows samples of the reader's stream, if it is not described. A line on
+// standard error names the type and its program.
 TypeInfo obvious_type(Session& session, const RawReader& reader, std::string_view verb);
 
 // What to show of a stream as it is now: its own type, or `obvious`, that of its programs, if it is

@@ -15,7 +15,7 @@
 namespace dssm::daemon {
 namespace {
 
-// Without who asks for it getting anything.
+// Whether the request has an effect besides its answer.
 bool changes_something(const local::Request& request) noexcept {
   const std::optional<Action> action = action_of(request);
   return action == Action::close || action == Action::remove || action == Action::set_property ||

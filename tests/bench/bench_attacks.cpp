@@ -176,6 +176,16 @@ const std::vector<Attack>& attacks() {
     return all;
   }();
   static const std::string watch = local_frame([](local::Request& r) { r.mutable_watch(); });
+  const auto never_read = [](const std::string& frame) {
+    return [frame](const std::string& socket, const std::string&) {
+      std::vector<Hostile> many;
+      for (int i = 0; i < 20; ++i) many.push_back(Hostile::local(socket));
+      for (;;) {
+        for (Hostile& one : many) one.send_some(frame);
+        ::usleep(1000);
+      }
+    };
+  };
   static const std::vector<Attack> all = {
       {"16 lists at once, read slowly",
        [](const std::string& socket, const std::string&) {
@@ -188,24 +198,8 @@ const std::vector<Attack>& attacks() {
            }
          }
        }},
-      {"20 programs ask for lists and never read",
-       [](const std::string& socket, const std::string&) {
-         std::vector<Hostile> many;
-         for (int i = 0; i < 20; ++i) many.push_back(Hostile::local(socket));
-         for (;;) {
-           for (Hostile& one : many) one.send_some(list);
-           ::usleep(1000);
-         }
-       }},
-      {"20 programs watch and never read",
-       [](const std::string& socket, const std::string&) {
-         std::vector<Hostile> many;
-         for (int i = 0; i < 20; ++i) many.push_back(Hostile::local(socket));
-         for (;;) {
-           for (Hostile& one : many) one.send_some(watch);
-           ::usleep(1000);
-         }
-       }},
+      {"20 programs ask for lists and never read", never_read(list)},
+      {"20 programs watch and never read", never_read(watch)},
       {"a program watches again and again",
        [](const std::string& socket, const std::string&) {
          Hostile hostile = Hostile::local(socket);
