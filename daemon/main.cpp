@@ -207,6 +207,13 @@ struct OtherHosts {
     parts.on_ring_replaced = [this](const Stream& old) { service.on_ring_replaced(old); };
   }
 
+  void on_their_heartbeat(const wire::Greeting& them,
+                          const std::optional<clock::HeartbeatTimes>& returned) {
+    clock.poll_if_due();
+    if (returned) clock.add_returned_untrusted(them.host_id, *returned);
+    if (PeerConnection* own = peers.connection_to(them.host_id)) own->on_their_heartbeat();
+  }
+
   std::shared_ptr<wire::ClockReport> own_clock;
   std::shared_ptr<wire::OwnCredentials> credentials;
   wire::Greeting self;
@@ -242,7 +249,11 @@ class Dssmd {
                &hosts_.service),
         server_(loop, sockets.listener, config.name, client_limits(config), local_, logger),
         channels_({loop, streams_.registry, streams_.opens, rights_, logger, &hosts_.clock,
-                   [this] { hosts_.clock.poll_if_due(); }, config.insecure,
+                   [this](const wire::Greeting& them,
+                          const std::optional<clock::HeartbeatTimes>& returned) {
+                     hosts_.on_their_heartbeat(them, returned);
+                   },
+                   config.insecure,
                    [this](const wire::SocketAddress& from, const wire::CertifiedPeer* certified) {
                      return hosts_.peers.is_configured(from, certified);
                    },

@@ -26,7 +26,7 @@ struct ClockReading {
 
 struct ClockLine {
   // Beyond this the wall clock has left the line. On top comes what reading two clocks takes.
-  static constexpr Duration kMaxOff = std::chrono::microseconds(8);
+  static constexpr Duration kMaxOff = std::chrono::microseconds(4);
   // A line that is older is not used: dssmd draws a new one much earlier.
   static constexpr Duration kMaxAge = std::chrono::hours(1);
   // Faster or slower than this no program can make the wall clock (adjtimex(2): a tenth).

@@ -399,7 +399,26 @@ void FleetClock::measure(const wire::ClockReport& theirs) {
       pair.raws.add_untrusted(*theirs.heartbeat)) {
     pair.is_confirmed = true;
   }
-  if (!pair.is_confirmed) return;
+  if (pair.is_confirmed) state(pair, theirs);
+}
+
+void FleetClock::add_returned_untrusted(const wire::HostId& host,
+                                        const clock::HeartbeatTimes& times) {
+  const KnownHost* known = catalog_.find(host);
+  if (!known || !known->greeting.clock) return;
+  const wire::ClockReport& theirs = *known->greeting.clock;
+  const auto pair = pairs_.find(theirs.boot_id);
+  if (pair == pairs_.end() || !pair->second.is_confirmed ||
+      pair->second.setting != theirs.setting ||
+      times.asked <= std::max(pairs_since_, pair->second.since)) {
+    return;
+  }
+  pair->second.raws.add_returned_untrusted(times);
+  state(pair->second, theirs);
+}
+
+// Remembers what is measured at this moment.
+void FleetClock::state(Pair& pair, const wire::ClockReport& theirs) {
   const auto walls = walls_of(pair, theirs);
   if (!walls) return;
   pair.last = *walls;

@@ -91,6 +91,8 @@ class FleetClock final : public ClockAssessor,
 
   // dssmd is awake: a question to chronyd that is about due is sent now, which saves a wake-up.
   void poll_if_due() { watch_.poll_if_due(); }
+  // What the heartbeats of `host` say of its clock (PairMeasurement::add_returned_untrusted()).
+  void add_returned_untrusted(const wire::HostId& host, const clock::HeartbeatTimes& times);
   // How far that host's clock may be from this one's.
   Duration distance_to(const wire::ClockReport& other) const;
   // Why the times of that host's samples are not good here, in a sentence; empty: they are, or
@@ -160,6 +162,7 @@ class FleetClock final : public ClockAssessor,
   void update_setting(const clock::Instant& now);
   void update_line(RawTime now);
   void measure(const wire::ClockReport& theirs);
+  void state(Pair& pair, const wire::ClockReport& theirs);
   std::optional<clock::WallDifference> walls_of(const Pair& pair,
                                                 const wire::ClockReport& theirs) const;
   // limit: earlier samples that were further off are not covered

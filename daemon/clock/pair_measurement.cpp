@@ -32,37 +32,57 @@ PartsPerBillion rounded_up_ppb(double ppb) noexcept {
 }  // namespace
 
 bool PairMeasurement::add_untrusted(const HeartbeatTimes& times) noexcept {
+  const std::optional<Heartbeat> newest = heartbeat_untrusted(times);
+  if (!newest || (!heartbeats_.empty() && newest->answered <= heartbeats_.back().answered)) {
+    return false;
+  }
+  if (add(*newest)) return true;
+  heartbeats_ = {*newest};
+  find_sides();
+  return true;
+}
+
+void PairMeasurement::add_returned_untrusted(const HeartbeatTimes& times) noexcept {
+  if (heartbeats_.empty() || times.asked < heartbeats_.front().answered ||
+      times.answered <= heartbeats_.back().answered) {
+    return;
+  }
+  std::optional<Heartbeat> newest = heartbeat_untrusted(times);
+  if (!newest) return heartbeats_.clear();  // faster than possible: a clock stood still
+  newest->round_trip.reset();
+  if (!add(*newest)) heartbeats_.clear();
+}
+
+std::optional<PairMeasurement::Heartbeat> PairMeasurement::heartbeat_untrusted(
+    const HeartbeatTimes& times) noexcept {
   for (const RawTime t : {times.asked, times.received, times.sent, times.answered}) {
-    if (!is_valid(t)) return false;
+    if (!is_valid(t)) return std::nullopt;
   }
   const Duration took = times.answered - times.asked, there = times.sent - times.received;
-  if (took <= Duration::zero() || there < Duration::zero()) return false;
+  if (took <= Duration::zero() || there < Duration::zero()) return std::nullopt;
   // Their clock may count up to kMaxRate more or less than this one.
   const Duration most = took - there + growth(there, kMaxRate);
-  if (most < Duration::zero()) return false;
-  if (!heartbeats_.empty() && times.answered <= heartbeats_.back().answered) return false;
-  while (!heartbeats_.empty() && (heartbeats_.size() == kMaxHeartbeats ||
-                                  times.answered - heartbeats_.front().answered > kWindow)) {
-    heartbeats_.pop_front();
-  }
+  if (most < Duration::zero()) return std::nullopt;
   // The question took at most `most`, and so did the answer: by then the difference may have moved.
   const Duration moved = growth(most, kMaxRate);
   const Duration greatest = times.received.time_since_epoch() - times.asked.time_since_epoch();
   const Duration least = times.sent.time_since_epoch() - times.answered.time_since_epoch();
-  const Heartbeat newest{times.answered,
-                         {times.answered, least - moved},
-                         {std::min(times.asked + most, times.answered), greatest + moved},
-                         std::max(took - there, Duration::zero())};
-  if (is_excluded(newest)) heartbeats_.clear();
+  return Heartbeat{times.answered,
+                   {times.answered, least - moved},
+                   {std::min(times.asked + most, times.answered), greatest + moved},
+                   std::max(took - there, Duration::zero())};
+}
+
+bool PairMeasurement::add(const Heartbeat& newest) noexcept {
+  while (!heartbeats_.empty() && (heartbeats_.size() == kMaxHeartbeats ||
+                                  newest.answered - heartbeats_.front().answered > kWindow)) {
+    heartbeats_.pop_front();
+  }
+  if (is_excluded(newest)) return false;
   heartbeats_.push_back(newest);
   find_sides();
-  const double from_above = above_.limit.at(times.answered);
-  const double from_below = -below_.limit.at(times.answered);
-  if (from_above < from_below || above_.fastest_ppb < -below_.fastest_ppb) {
-    heartbeats_ = {newest};
-    find_sides();
-  }
-  return true;
+  return above_.limit.at(newest.answered) >= -below_.limit.at(newest.answered) &&
+         above_.fastest_ppb >= -below_.fastest_ppb;
 }
 
 // Whether the earlier heartbeats exclude it.
@@ -133,10 +153,11 @@ std::optional<PairMeasurement::Difference> PairMeasurement::at(RawTime now) cons
 }
 
 Duration PairMeasurement::best_round_trip() const noexcept {
-  const auto best = std::min_element(
-      heartbeats_.begin(), heartbeats_.end(),
-      [](const Heartbeat& a, const Heartbeat& b) { return a.round_trip < b.round_trip; });
-  return best == heartbeats_.end() ? Duration::zero() : best->round_trip;
+  std::optional<Duration> best;
+  for (const Heartbeat& one : heartbeats_) {
+    if (one.round_trip && (!best || *one.round_trip < *best)) best = one.round_trip;
+  }
+  return best.value_or(Duration::zero());
 }
 
 }  // namespace dssm::clock

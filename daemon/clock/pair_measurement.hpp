@@ -24,7 +24,7 @@ class PairMeasurement {
  public:
   // Heartbeats that are older are not used.
   static constexpr Duration kWindow = std::chrono::seconds(64);
-  static constexpr std::size_t kMaxHeartbeats = 64;
+  static constexpr std::size_t kMaxHeartbeats = 128;
   // Two oscillators depart from each other by less than this. Twice what the kernel can correct of
   // one of them (adjtimex(2): 500 ppm).
   static constexpr PartsPerBillion kMaxRate = 1'000'000;
@@ -42,13 +42,18 @@ class PairMeasurement {
   // virtual machine was moved): then only the newest one counts. False: its times are impossible,
   // or a later one was answered before, and it is ignored.
   bool add_untrusted(const HeartbeatTimes& times) noexcept;
+  // What the other PC's own heartbeats say: this PC's answer to one of them, and the next one.
+  // About a second is between the two, in which a clock may have stood still. So it counts only
+  // beside heartbeats of this PC from before, and when it excludes these, none counts until the
+  // next one.
+  void add_returned_untrusted(const HeartbeatTimes& times) noexcept;
   void clear() noexcept { heartbeats_.clear(); }
 
   // At `now`. nullopt: there is no heartbeat within kWindow before it, or one after it.
   std::optional<Difference> at(RawTime now) const noexcept;
 
-  // The shortest round trip in the window, without the time that the other PC took to answer; zero:
-  // there is none.
+  // The shortest round trip of this PC's heartbeats in the window, without the time that the other
+  // PC took to answer; zero: there is none.
   Duration best_round_trip() const noexcept;
 
  private:
@@ -60,7 +65,7 @@ class PairMeasurement {
   struct Heartbeat {
     RawTime answered;
     Bound least, greatest;
-    Duration round_trip;
+    std::optional<Duration> round_trip;  // none: it was returned, and took long there
   };
   // What two heartbeats say of later moments:
   //   difference <= later.difference + (now - later.at) * rate
@@ -78,6 +83,9 @@ class PairMeasurement {
     double fastest_ppb = 0;  // what it gains
   };
 
+  static std::optional<Heartbeat> heartbeat_untrusted(const HeartbeatTimes& times) noexcept;
+  // False: the heartbeats exclude each other.
+  bool add(const Heartbeat& newest) noexcept;
   Side find_side(bool from_above, RawTime when) const noexcept;
   void find_sides() noexcept;
   bool is_excluded(const Heartbeat& newest) const noexcept;

@@ -99,6 +99,7 @@ void PeerConnection::on_up(FrameConnection& connection, const wire::Greeting& th
 void PeerConnection::on_down(const Error& error) {
   const bool attempt = status_.state != HostState::up;
   heartbeat_.disable();
+  beat_at_ = {};
   watching_ = false;
   round_trips_ = {};
   carried_bytes_per_s_ = 0;
@@ -165,7 +166,14 @@ void PeerConnection::watch() {
   });
 }
 
-void PeerConnection::start_heartbeat() { beat(); }
+void PeerConnection::start_heartbeat() {
+  answered_ = {};
+  beat();
+}
+
+void PeerConnection::on_their_heartbeat() {
+  if (beat_at_ != MonoTime() && loop_.now() - beat_at_ >= wire::kHeartbeat / 2) beat();
+}
 
 // Called every kHeartbeat, or when the peer timeout is over, whichever is first. This is where a
 // peer that does not answer any more counts as dead (peers.hpp).
@@ -182,8 +190,13 @@ void PeerConnection::beat() {
                      std::chrono::duration_cast<std::chrono::milliseconds>(silent).count())});
   }
   net::Frame request;
-  wire::send_clock(self_, *request.mutable_ping()->mutable_clock());
-  ask(std::move(request), [this, now, asked = RawClock::now()](const Result<net::Frame>& answer) {
+  net::Ping& ping = *request.mutable_ping();
+  wire::send_clock(self_, *ping.mutable_clock());
+  ping.set_answered_ns(to_ns(std::exchange(answered_, {})));
+  beat_at_ = now;
+  asked_ = RawClock::now();
+  ping.set_raw_ns(to_ns(asked_));
+  ask(std::move(request), [this, now, asked = asked_](const Result<net::Frame>& answer) {
     on_pong(now, asked, answer);
   });
   heartbeat_.enable_in(std::min(wire::kHeartbeat, timeout - silent));
@@ -195,21 +208,26 @@ void PeerConnection::take_clock(std::shared_ptr<const wire::ClockReport> clock) 
 }
 
 void PeerConnection::on_pong(MonoTime asked, RawTime asked_raw, const Result<net::Frame>& answer) {
-  RawTime answered_raw = RawClock::now();
+  const RawTime answered = arrival(RawClock::now());
   if (!answer || !answer->has_pong()) return;
+  if (asked_raw == asked_) answered_ = answered;  // else the next heartbeat is under way already
   const Duration took = loop_.now() - asked;
   const Duration min = round_trips_.min;
   round_trips_ = {took, min == Duration::zero() ? took : std::min(min, took)};
   carried_bytes_per_s_ = answer->pong().carried_bytes_per_s();
   if (!answer->pong().has_clock()) return;
   wire::ClockReport clock = wire::clock_report_untrusted(answer->pong().clock(), asked);
-  const FrameConnection* link = dialer_.connection();
-  if (link && self_.clock) answered_raw = self_.clock->line.arrival(link->arrived(), answered_raw);
   const net::Pong& pong = answer->pong();
   const std::int64_t received_ns = pong.received_ns() ? pong.received_ns() : pong.raw_ns();
   clock.heartbeat = {asked_raw, RawTime(Duration(received_ns)), RawTime(Duration(pong.raw_ns())),
-                     answered_raw};
+                     answered};
   take_clock(std::make_shared<const wire::ClockReport>(std::move(clock)));
+}
+
+// When what was read at `read` came.
+RawTime PeerConnection::arrival(RawTime read) {
+  const FrameConnection* link = dialer_.connection();
+  return link && self_.clock ? self_.clock->line.arrival(link->arrived(), read) : read;
 }
 
 }  // namespace dssm::daemon

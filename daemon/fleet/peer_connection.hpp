@@ -72,6 +72,9 @@ class PeerConnection final : private Dialer::Observer {
 
   // Sends a heartbeat each second, and closes the connection when the peer is dead: see beat().
   void start_heartbeat();
+  // The peer's own heartbeat came: both PCs are awake, so that this one's is answered sooner now
+  // than at any other time. Sent if half of its second has passed.
+  void on_their_heartbeat();
 
   // Closes the connection and dials again later.
   void drop(const Error& error) { dialer_.restart(error); }
@@ -133,6 +136,7 @@ class PeerConnection final : private Dialer::Observer {
   void beat();
   void take_clock(std::shared_ptr<const wire::ClockReport> clock);
   void on_pong(MonoTime asked, RawTime asked_raw, const Result<net::Frame>& answer);
+  RawTime arrival(RawTime read);
   void enter(HostState state, HostReason reason, std::optional<Error> error);
 
   PeerConnection(const EventLoop& loop, Resolver& resolver, std::optional<wire::HostId> expected,
@@ -146,6 +150,8 @@ class PeerConnection final : private Dialer::Observer {
   Status status_;
   std::optional<wire::Greeting> them_;
   RoundTrips round_trips_;
+  MonoTime beat_at_{};
+  RawTime asked_{}, answered_{};  // the last heartbeat; answered_ 0: not yet
   std::uint64_t carried_bytes_per_s_ = 0;
   bool watching_ = false;
   Requests requests_;

@@ -37,9 +37,11 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
     const OpenTable& opens;
     const Rights& rights;
     Logger& logger;
-    ClockAssessor* clock = nullptr;           // nullptr: the clock is not watched
-    std::function<void()> on_heartbeat = {};  // of another host, about once a second; may be empty
-    bool takes_plain = false;                 // with credentials: from other PCs, too
+    ClockAssessor* clock = nullptr;  // nullptr: the clock is not watched
+    // A heartbeat came, about once a second from each host: DataCommunicator::Observer; may be empty
+    std::function<void(const wire::Greeting&, const std::optional<clock::HeartbeatTimes>&)>
+        on_heartbeat = {};
+    bool takes_plain = false;  // with credentials: from other PCs, too
     // Whether a connection comes from a configured peer (Peers::is_configured()); may be empty.
     std::function<bool(const wire::SocketAddress&, const wire::CertifiedPeer*)> is_configured = {};
     PlaybackClockOwner* playback = nullptr;  // nullptr: there is no playback clock
@@ -111,7 +113,8 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
   void on_recovered() override;
   void on_ended(DataCommunicator& communicator) override;
   void on_greeted(DataCommunicator& communicator) override { forget_arrival(communicator); }
-  void on_heartbeat() override;
+  void on_heartbeat(const wire::Greeting& them,
+                    const std::optional<clock::HeartbeatTimes>& returned) override;
 
   Parts parts_;
   RateLimitedLogger logger_;

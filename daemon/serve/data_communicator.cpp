@@ -229,9 +229,16 @@ Result<void> DataCommunicator::dispatch(const net::Frame& request) {
     pong.mutable_pong()->set_received_ns(to_ns(received));
     pong.mutable_pong()->set_carried_bytes_per_s(
         static_cast<std::uint64_t>(place_.pace().carried_bytes_per_s(parts_.loop.coarse_now())));
-    pong.mutable_pong()->set_raw_ns(to_ns(RawClock::now()));
+    std::optional<clock::HeartbeatTimes> returned;
+    if (const net::Ping& ping = request.ping(); pong_sent_ != RawTime() && ping.answered_ns()) {
+      returned = {pong_sent_, RawTime(Duration(ping.answered_ns())),
+                  RawTime(Duration(ping.raw_ns())), received};
+    }
+    const RawTime now = RawClock::now();
+    if (request.ping().raw_ns()) pong_sent_ = now;
+    pong.mutable_pong()->set_raw_ns(to_ns(now));
     link_.send(pong);
-    parts_.observer.on_heartbeat();
+    parts_.observer.on_heartbeat(*them_, returned);
     return {};
   }
   if (!channel_ && is_control(request)) return serve_control(request);

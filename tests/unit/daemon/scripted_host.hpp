@@ -162,12 +162,14 @@ class ScriptedPeer final : public ScriptedHost {
   std::int64_t ping_received_ns = 0, pong_sent_ns = 0;  // what its Pongs say
   std::uint64_t carried_bytes_per_s = 0;
   int pings = 0, watches = 0;
+  net::Ping last_ping;
 
  private:
   void on_request(const net::Frame& request) override {
     net::Frame answer = answer_to(request);
     if (request.has_ping()) {
       ++pings;
+      last_ping = request.ping();
       if (!answers_heartbeat) return;
       answer.mutable_pong()->mutable_clock()->set_bound_ns(1000);
       answer.mutable_pong()->mutable_clock()->set_anchor(std::string(16, 'r'));

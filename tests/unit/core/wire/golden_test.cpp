@@ -294,6 +294,8 @@ const std::map<std::string, Fill>& messages() {
        [](net::Frame& frame) {
          frame.set_serial(9);
          frame.mutable_ping()->mutable_clock()->set_bound_ns(to_ns(kUnknownClockError));
+         frame.mutable_ping()->set_raw_ns(4000);
+         frame.mutable_ping()->set_answered_ns(3000);
        }},
       {"pong",
        [](net::Frame& frame) {

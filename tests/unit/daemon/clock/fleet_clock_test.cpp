@@ -365,6 +365,30 @@ TEST_F(MeasuredTest, AClockThatWasFarOffAMomentAgoCostsOnlyTheSamplesOfThatTime)
   EXPECT_GT(found().measured_from, before);
 }
 
+// This one's was slow.
+TEST_F(MeasuredTest, TheOtherHostsHeartbeatsCountToo) {
+  start();
+  wire::Greeting other = host(kOther, "pc3", kUnknownClockError);
+  other.clock = pc3 = answered(*other.clock, 0us, 1, 20ms);
+  catalog.host_up(other, {"10.0.0.3", 13776});
+  catalog.set_clock(kOther, pc3);
+  EXPECT_GE(fleet->distance_to(*pc3), 10ms);
+  const auto return_one = [&](const wire::HostId& from) {
+    const RawTime now = later().raw;
+    fleet->add_returned_untrusted(from, {now - 100us, now - 50us, now - 50us, now});
+  };
+  return_one(kReference);  // which is not there
+  EXPECT_GE(fleet->distance_to(*pc3), 10ms);
+  return_one(kOther);
+  EXPECT_LE(fleet->distance_to(*pc3), 5ms);
+  auto stepped = std::make_shared<wire::ClockReport>(*pc3);
+  stepped->setting = 2;
+  stepped->heartbeat.reset();
+  catalog.set_clock(kOther, stepped);
+  return_one(kOther);
+  EXPECT_EQ(fleet->distance_to(*stepped), kUnknownClockError) << "its clock may have stood still";
+}
+
 TEST_F(MeasuredTest, AHostThatReportsEverNewBootsFillsNoMoreThanTheTable) {
   start();
   heartbeat(0us);

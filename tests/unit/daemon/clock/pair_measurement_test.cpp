@@ -19,6 +19,8 @@ using namespace std::chrono_literals;
 
 Duration ns(double value) { return Duration(std::llround(value)); }
 
+constexpr Duration kTolerance = ClockLine::kMaxOff + 2us;
+
 // An oscillator and the wall clock that is made of it.
 struct Pc {
   double raw_ns = 1e12;
@@ -37,12 +39,12 @@ struct Pc {
   Time wall() const { return Time(ns(wall_ns)); }
   void step(double by_ns) {
     wall_ns += by_ns;
-    line = {raw(), wall(), line.rate, 10us};
+    line = {raw(), wall(), line.rate, kTolerance};
   }
   // As FleetClock does before each batch of samples.
   void keep_line() {
     const std::optional<Time> expected = line.at(raw());
-    if (expected && std::chrono::abs(wall() - *expected) <= 8us) return;
+    if (expected && std::chrono::abs(wall() - *expected) <= ClockLine::kMaxOff) return;
     if (expected) {
       const auto age = static_cast<double>((raw() - line.raw).count());
       line.rate =
@@ -50,7 +52,7 @@ struct Pc {
     }
     line.raw = raw();
     line.wall = wall();
-    line.tolerance = 10us;
+    line.tolerance = kTolerance;
     ++lines;
   }
 };
@@ -86,6 +88,18 @@ class PairMeasurementTest : public testing::Test {
     pass(least_ns + (is_forth ? 0 : uniform(0, most_ns)));
     times.answered = ours.raw();
     pair.add_untrusted(times);
+  }
+  // Their heartbeat, right after this one's and as good, and what its answer and the next one say.
+  void beat_back(double there_ns = 1e9) {
+    HeartbeatTimes times;
+    times.asked = ours.raw();
+    pass(least_ns);
+    times.received = theirs.raw();
+    pass(there_ns);
+    times.sent = theirs.raw();
+    pass(least_ns);
+    times.answered = ours.raw();
+    pair.add_returned_untrusted(times);
   }
   PairMeasurement::Difference difference() const { return pair.at(ours.raw()).value(); }
   double true_ns() const { return theirs.raw_ns - ours.raw_ns; }
@@ -189,6 +203,72 @@ TEST_F(PairMeasurementTest, AfterAPcHasSleptOnlyNewHeartbeatsCount) {
   }
   ours.pass(5e9);  // theirs stands still
   beat(1e4);
+  expect_true();
+}
+
+// One's own are slow: then the other PC's say more.
+TEST_F(PairMeasurementTest, TheOtherPcsHeartbeatsCountToo) {
+  theirs.rate = 60e-6;
+  least_ns = 2e6;
+  for (int i = 0; i < 30; ++i) {
+    beat(0);
+    pass(1e9);
+  }
+  const PairMeasurement::Difference before = difference();
+  EXPECT_GE(before.greatest - before.least, 4ms);
+  least_ns = 2e4;
+  for (int i = 0; i < 30; ++i) {
+    beat_back();
+    for (int j = 0; j < 10; ++j) {
+      pass(1e8);
+      expect_true();
+    }
+  }
+  EXPECT_LE(difference().greatest - difference().least, 150us);
+  EXPECT_EQ(pair.best_round_trip(), 4ms) << "of this PC's own ones";
+}
+
+TEST_F(PairMeasurementTest, TheOtherPcsHeartbeatsAreTrueWhateverTheRateAndTheDelays) {
+  for (const double rate : {0.0, 50e-6, -300e-6}) {
+    pair.clear();
+    theirs.rate = rate;
+    for (int i = 0; i < 300; ++i) {
+      least_ns = uniform(1e4, 2e5);
+      beat(2e6);
+      beat_back(uniform(0, 1.5e9));
+      for (int j = 0; j < 10; ++j) {
+        pass(1e8);
+        expect_true();
+      }
+    }
+  }
+}
+
+// Whether a clock stood still before or after their heartbeat cannot be told.
+TEST_F(PairMeasurementTest, TheOtherPcsHeartbeatsNeverCountAlone) {
+  beat_back();
+  EXPECT_FALSE(pair.at(ours.raw()));
+  for (int i = 0; i < 20; ++i) {
+    beat(1e4);
+    pass(1e9);
+  }
+  HeartbeatTimes times;  // their clock goes ahead meanwhile
+  times.asked = ours.raw();
+  pass(least_ns);
+  times.received = theirs.raw();
+  theirs.raw_ns += 3e9;
+  pass(1e9);
+  times.sent = theirs.raw();
+  pass(least_ns);
+  times.answered = ours.raw();
+  pair.add_returned_untrusted(times);
+  EXPECT_FALSE(pair.at(ours.raw())) << "it excludes those before";
+  beat(1e4);
+  expect_true();
+  pair.clear();
+  beat(1e4);
+  times.answered = ours.raw() + 1us;
+  pair.add_returned_untrusted(times);  // its answer was before the only one that counts
   expect_true();
 }
 

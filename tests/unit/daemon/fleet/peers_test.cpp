@@ -142,6 +142,41 @@ TEST_F(PeersTest, ReportTheFourTimesOfAHeartbeat) {
   EXPECT_EQ(heartbeat().received, RawTime(Duration(9)));
 }
 
+// The other PC needs them for its own measurement.
+TEST_F(PeersTest, TellWhenAHeartbeatLeftAndTheAnswerBeforeCame) {
+  start({&one});
+  const RawTime begin = RawClock::now();
+  wait([&] { return one.pings >= 2; });
+  const net::Ping second = one.last_ping;
+  EXPECT_GE(second.answered_ns(), to_ns(begin));
+  EXPECT_GE(second.raw_ns(), second.answered_ns());
+  one.delay = wire::kHeartbeat * 3 / 2;
+  wait([&] { return one.pings >= 5; });
+  EXPECT_GE(one.last_ping.raw_ns(), second.raw_ns());
+  EXPECT_EQ(one.last_ping.answered_ns(), 0) << "the answer before is still under way";
+}
+
+TEST_F(PeersTest, BeatWithTheOtherHost) {
+  start({&one});
+  wait([&] { return one.pings >= 2; });
+  const MonoTime begin = loop.now();
+  const int before = one.pings;
+  PeerConnection& connection = *peers->connection_to(one.host().greeting.host_id);
+  connection.on_their_heartbeat();  // too early
+  bool is_later = false;
+  EventSource later = EventSource::timer(loop, [&] {
+    connection.on_their_heartbeat();
+    is_later = true;
+  });
+  later.enable_in(wire::kHeartbeat * 3 / 4);
+  wait([&] { return is_later; });
+  EXPECT_EQ(one.pings, before);
+  wait([&] { return one.pings == before + 1; });
+  EXPECT_EQ(loop.now() - begin, wire::kHeartbeat * 3 / 4);
+  wait([&] { return one.pings == before + 2; });
+  EXPECT_EQ(loop.now() - begin, wire::kHeartbeat * 7 / 4) << "a second after the last one";
+}
+
 TEST_F(PeersTest, RefuseAPeerThatSendsInvalidStreamEvents) {
   start({&one});
   wait_for_startup();

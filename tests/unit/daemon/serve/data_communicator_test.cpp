@@ -443,6 +443,38 @@ TEST(DataCommunicator, SaysWhenAPingArrivedAndWhenItWasAnswered) {
   EXPECT_LT(pong.received_ns(), to_ns(put + 10ms)) << "not when it was received from the kernel";
 }
 
+TEST(DataCommunicator, ReportsWhatTheHeartbeatsOfAPeerSayOfTheClocks) {
+  std::vector<std::optional<clock::HeartbeatTimes>> reported;
+  std::string host;
+  ServerRig rig;
+  rig.on_heartbeat = [&](const wire::Greeting& them, const auto& returned) {
+    host = them.host;
+    reported.push_back(returned);
+  };
+  MemoryPeer peer;
+  rig.connect(peer);
+  const auto ping = [&](std::uint64_t serial, std::int64_t raw_ns, std::int64_t answered_ns) {
+    net::Frame frame = with_serial(serial, ping_frame());
+    frame.mutable_ping()->set_raw_ns(raw_ns);
+    frame.mutable_ping()->set_answered_ns(answered_ns);
+    return rig.ask(peer, frame).pong();
+  };
+  const net::Pong first = ping(3, 1000, 900);  // there is no answer that could have come at 900
+  ping(4, 0, 0);                               // not a heartbeat of a dssmd that measures
+  const net::Pong last = ping(5, 3000, 2000);
+  ping(6, 4000, 0);  // the last answer had not come there
+  ASSERT_EQ(reported.size(), 4u);
+  EXPECT_EQ(host, "pc2");
+  EXPECT_FALSE(reported[0]);
+  EXPECT_FALSE(reported[1]);
+  ASSERT_TRUE(reported[2]);
+  EXPECT_EQ(to_ns(reported[2]->asked), first.raw_ns());
+  EXPECT_EQ(to_ns(reported[2]->received), 2000);
+  EXPECT_EQ(to_ns(reported[2]->sent), 3000);
+  EXPECT_EQ(to_ns(reported[2]->answered), last.received_ns());
+  EXPECT_FALSE(reported[3]);
+}
+
 // One with a channel, or with heartbeats, stays.
 TEST(DataCommunicator, EndsConnectionsThatDoNothing) {
   ServerRig rig;

@@ -35,13 +35,10 @@ class ServerRig {
  public:
   explicit ServerRig(const PeerTable::Limits& limits = {16, 8, 32U << 20},
                      ClockAssessor* clock = nullptr, const Rights* rights = nullptr)
-      : server({loop,
-                registry,
-                opens,
-                rights ? *rights : no_rights,
-                logger,
-                clock,
-                {},
+      : server({loop, registry, opens, rights ? *rights : no_rights, logger, clock,
+                [this](const wire::Greeting& them, const auto& returned) {
+                  if (on_heartbeat) on_heartbeat(them, returned);
+                },
                 false,
                 [this](const wire::SocketAddress& from, const wire::CertifiedPeer*) {
                   return from.str() == configured;
@@ -111,6 +108,8 @@ class ServerRig {
   }
 
   std::string configured;  // address of a configured peer; empty: none
+  std::function<void(const wire::Greeting&, const std::optional<clock::HeartbeatTimes>&)>
+      on_heartbeat;
   // What it reports of its clock.
   const std::shared_ptr<wire::ClockReport> own_clock = std::make_shared<wire::ClockReport>();
   EventLoop loop = *EventLoop::open(TimerQueue::Time::simulated);
