@@ -221,7 +221,7 @@ pid_t start_view(const std::string& socket, std::uint16_t& port) {
   int output[2];
   if (::pipe(output) != 0) fail("pipe");
   const pid_t pid = test::start({test::built("client/view/dssm-view"), "--listen", "127.0.0.1:0",
-                                 "--socket", socket, "--pages", "/nonexistent"},
+                                 "--socket", socket, "--pages", test::source("client/view/web")},
                                 {}, output[1]);
   ::close(output[1]);
   std::string line;

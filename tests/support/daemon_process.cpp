@@ -59,17 +59,19 @@ pid_t spawn(const std::vector<std::string>& argv, const std::vector<std::string>
   return pid;
 }
 
-}  // namespace
-
-std::string built(const std::string& path) {
-  const char* root = std::getenv("DSSM_BUILD_ROOT");
+std::string below(const char* variable, const std::string& path) {
+  const char* root = std::getenv(variable);  // NOLINT(concurrency-mt-unsafe): nothing sets it
   if (!root) {
-    std::fprintf(stderr,
-                 "test harness: $DSSM_BUILD_ROOT is not set; run me through `meson test`\n");
+    std::fprintf(stderr, "test harness: $%s is not set; run me through `meson test`\n", variable);
     std::abort();
   }
   return std::string(root) + "/" + path;
 }
+
+}  // namespace
+
+std::string built(const std::string& path) { return below("DSSM_BUILD_ROOT", path); }
+std::string source(const std::string& path) { return below("DSSM_SOURCE_ROOT", path); }
 
 std::string make_temp_dir() {
   std::string path = "/tmp/dssm-test-XXXXXX";

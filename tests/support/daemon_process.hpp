@@ -17,6 +17,9 @@ namespace dssm::test {
 // sets for every test.
 std::string built(const std::string& path);
 
+// The path of a file of the sources, from $DSSM_SOURCE_ROOT likewise.
+std::string source(const std::string& path);
+
 // A new empty folder below /tmp (short enough for socket paths); remove_tree() removes it.
 std::string make_temp_dir();
 void remove_tree(const std::string& path);

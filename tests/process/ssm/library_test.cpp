@@ -15,10 +15,6 @@
 namespace dssm::test {
 namespace {
 
-std::string source(const std::string& path) {
-  return std::string(std::getenv("DSSM_SOURCE_ROOT")) + "/" + path;
-}
-
 // Compiles a program that includes `headers`, one by one and all, strictly.
 void compile(const std::string& compiler, const std::string& dialect, const std::string& suffix,
              const std::vector<std::string>& headers) {

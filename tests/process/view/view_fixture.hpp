@@ -14,12 +14,6 @@
 
 namespace dssm::test {
 
-// The path of a file of the sources.
-inline std::string source(const std::string& path) {
-  const char* root = std::getenv("DSSM_SOURCE_ROOT");  // NOLINT(concurrency-mt-unsafe)
-  return std::string(root == nullptr ? "." : root) + "/" + path;
-}
-
 // The command line of dssm-view with the page of the sources.
 inline std::vector<std::string> view_argv(std::vector<std::string> words) {
   std::vector<std::string> argv = {built("client/view/dssm-view"), "--pages",
