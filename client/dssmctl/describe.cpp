@@ -7,6 +7,7 @@
 #include <cmath>
 #include <ctime>
 
+#include "client/dssmctl/black_box_streams.hpp"
 #include "client/dssmctl/text.hpp"
 
 namespace dssm::ctl {

@@ -38,7 +38,7 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
     const Rights& rights;
     Logger& logger;
     ClockAssessor* clock = nullptr;  // nullptr: the clock is not watched
-    // A heartbeat came, about once a second from each host: DataCommunicator::Observer; may be empty
+    // As in DataCommunicator::Observer, about once a second from each host; may be empty.
     std::function<void(const wire::Greeting&, const std::optional<clock::HeartbeatTimes>&)>
         on_heartbeat = {};
     bool takes_plain = false;  // with credentials: from other PCs, too

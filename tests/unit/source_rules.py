@@ -14,6 +14,9 @@
 #   leaves comments alone, because it breaks tables).
 # * No constant of a source file has the name of one of the public headers: it would hide that from
 #   the sources that are compiled with it at once.
+# * A source includes the header of each function that it calls, itself or by another one; also
+#   where the sources that are compiled with it at once hide that. (Functions of namespaces with a
+#   name of their own; `./check alone` shows the rest.)
 # * A path of the sources in README.md or a document of docs/, and the target of a link, exists.
 import glob
 import os
@@ -88,6 +91,12 @@ SPLIT_RULER = re.compile(r"^\s*//(?! ---? ?\w).*---+$")
 SOURCE_PATH = re.compile(r"(?<![\w./-])(?:core|client|daemon|proto|tests|scripts)/[\w./{,}*-]*[\w}*/]")
 LINK = re.compile(r"\]\((?!\w+:)([^)#\s]+)")
 CODE_BLOCK = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
+# What is no code.
+IGNORED = re.compile(r'//[^\n]*|"(?:\\.|[^"\\\n])*"|\'(?:\\.|[^\'\\\n])*\'')
+# Functions of a namespace, whose lines are not indented, and of classes.
+FUNCTION = re.compile(r"^(?!return|using|typedef|friend|else|#|namespace|class|struct|enum)"
+                      r"(?:\[\[[\w:]+\]\] )?[\w:<>,&*\s]+?[\s&*](\w+)\(", re.MULTILINE)
+MEMBER = re.compile(r"^ +(?:\[\[\w+\]\] )?[\w:<>,&*\s]+?[\s&*](\w+)\(", re.MULTILINE)
 INCLUDE = re.compile(r'^\s*#\s*include\s+["<]([^">]+)[">]', re.MULTILINE)
 
 
@@ -205,6 +214,32 @@ def include_errors(root):
         yield f"{root} has no sources"
 
 
+def missing_include_errors(root):
+    code, graph = {}, {}
+    for path in sources(root, ("core", "client", "daemon")):
+        with open(os.path.join(root, path), encoding="utf-8") as file:
+            text = file.read()
+        code[path] = IGNORED.sub("", text)
+        graph[path] = list(included(root, path, text))
+    declared, members = {}, set()
+    for path in code:
+        if path.endswith(".hpp"):
+            for name in FUNCTION.findall(code[path]):
+                declared.setdefault(name, set()).add(path)
+            members.update(MEMBER.findall(code[path]))
+    unique = {name: min(paths) for name, paths in declared.items()
+              if len(paths) == 1 and name not in members}
+    for path in sorted(code):
+        reached, todo = set(), [path]
+        while todo:
+            reached.add(todo[-1])
+            todo.extend(other for other in graph[todo.pop()] if other not in reached)
+        known = {*FUNCTION.findall(code[path]), *re.findall(r"\bauto (\w+) = \[", code[path])}
+        for name in sorted(set(re.findall(r"(?<![\w.>:])(?:[a-z]+::)?([a-z]\w*)\(", code[path]))):
+            if name in unique and unique[name] not in reached and name not in known:
+                yield f"{path} calls {name}(), and does not include {unique[name]}"
+
+
 def path_exists(pattern):
     choice = re.search(r"{([^}]*)}", pattern)
     if choice:
@@ -227,7 +262,7 @@ def document_errors(root):
 
 def main(root):
     errors = [*include_errors(root), *hiding_errors(root), *comment_errors(root),
-              *document_errors(root)]
+              *missing_include_errors(root), *document_errors(root)]
     for error in errors:
         print(error)
     return 1 if errors else 0
