@@ -65,14 +65,20 @@ ClientNumber LocalService::connect(const Identity& identity, ClientOutput& outpu
   return number;
 }
 
-void LocalService::disconnect(ClientNumber number, bool by_client) {
-  const auto client = clients_.extract(number);
-  if (!client) return;
-  opens_.remove_all(number, by_client);
-  std::erase_if(deferred_, [number](const Deferred& one) { return one.client == number; });
-  if (client.mapped().greeted) {
-    logger_.debug("client disconnected", {.peer = client.mapped().identity->str()});
+bool LocalService::disconnect(ClientNumber number, bool by_client) {
+  if (const auto client = clients_.extract(number)) {
+    end_watch(number, client.mapped());
+    if (client.mapped().greeted) {
+      logger_.debug("client disconnected", {.peer = client.mapped().identity->str()});
+    }
   }
+  return leave(number, by_client);
+}
+
+void LocalService::on_reader_gone(ClientNumber number) {
+  Client& client = clients_.at(number);
+  client.has_reader = false;
+  end_watch(number, client);
 }
 
 bool LocalService::on_frame_untrusted(ClientNumber number, std::span<const std::byte> frame,
@@ -193,6 +199,9 @@ void LocalService::serve(ClientNumber number, const local::Request& request,
   }
   Result<Reply> reply = requests_.serve_untrusted(identity, request, descriptors);
   if (request.has_offer()) log_offer(*identity, request.offer(), reply);
+  // A program hears of what it did before the answer.
+  while (tell_news(number)) {
+  }
   on_answer(number, request.serial(), std::move(reply));
 }
 
@@ -219,7 +228,8 @@ void LocalService::on_answer(ClientNumber number, std::uint64_t serial, Result<R
   const auto client = clients_.find(number);
   if (client == clients_.end()) {
     // It disconnected meanwhile, perhaps because of the events of this request.
-    opens_.remove_all(number, false);
+    while (leave(number, false)) {
+    }
     return;
   }
   if (reply) {
@@ -248,23 +258,64 @@ void LocalService::log_offer(const ClientIdentity& client, const local::Offer& o
 }
 
 // First the existing streams, then the response: after a reconnect it shows the client that streams
-// which were not among them do not exist any more. Changes are sent at once, also those of streams
-// that have not been told: a receiver ignores what it knows.
+// which were not among them do not exist any more. Changes are told before further existing ones,
+// also those of streams that have not been told: a receiver ignores what it knows.
 void LocalService::watch(ClientNumber number, std::uint64_t serial) {
   Client& client = clients_.at(number);
+  if (!client.has_reader) return;
   Watch begun;
   if (client.watch) {
     begun.serials = std::move(client.watch->serials);
     begun.before = std::move(client.watch->before);
+    begun.news = client.watch->news;
+  } else {
+    begun.news = end_of_news();
+    informed_.insert(number);
+    ++watches_;
   }
   begun.serials.push_back(serial);
   client.watch = std::move(begun);
   client.output->request_turn();
 }
 
+void LocalService::end_watch(ClientNumber number, Client& client) {
+  if (!client.watch) return;
+  client.watch.reset();
+  informed_.erase(number);
+  --watches_;
+}
+
+bool LocalService::go_on(ClientNumber number) {
+  const Client& client = clients_.at(number);
+  if (client.watch) {
+    if (tell_news(number)) return true;
+    if (!clients_.contains(number)) return false;
+    if (client.watch->is_telling) return tell_streams(number);
+  }
+  return serve_deferred(number);
+}
+
+// Whether there are more. False, too, when the client does not watch, or is disconnected by then.
+bool LocalService::tell_news(ClientNumber number) {
+  std::size_t bytes = 0;
+  for (int sent = 0;; ++sent) {
+    const auto found = clients_.find(number);  // sending may end the connection
+    if (found == clients_.end() || !found->second.watch) return false;
+    Watch& watch = *found->second.watch;
+    if (watch.news == end_of_news()) return false;
+    if (sent == kStreamsPerTurn || bytes >= kStreamBytesPerTurn) return true;
+    const News& next = news_[watch.news++ - first_news_];
+    if (watch.news == end_of_news()) informed_.insert(number);
+    if (shows(found->second, next.stream) ||
+        (next.is_removed && showed(found->second, next.stream))) {
+      bytes += next.frame.size();
+      found->second.output->send(next.frame, {});
+    }
+  }
+}
+
 bool LocalService::tell_streams(ClientNumber number) {
   Client& client = clients_.at(number);
-  if (!client.has_reader || !client.watch || !client.watch->is_telling) return false;
   const std::vector<proto::StreamEvent> events = next_events(client);
   const bool is_telling = client.watch->is_telling;
   std::vector<std::uint64_t> serials;
@@ -367,29 +418,41 @@ void LocalService::send_failure(const Client& client, std::uint64_t serial, cons
   client.output->send(wire::encode_frame(failure_response(serial, error)), {});
 }
 
-// A copy: sending may end connections.
-std::vector<ClientNumber> LocalService::watchers() const {
-  std::vector<ClientNumber> watchers;
-  for (const auto& [number, client] : clients_) {
-    if (client.watch) watchers.push_back(number);
-  }
-  return watchers;
-}
-
 void LocalService::broadcast(const proto::StreamEvent& event) {
-  const std::vector<ClientNumber> watchers = this->watchers();
-  if (watchers.empty()) return;
+  if (watches_ == 0) return;
   local::Response response;
   *response.mutable_stream_event() = event;
-  const std::string frame = wire::encode_frame(response);
-  for (const ClientNumber number : watchers) {
-    const auto client = clients_.find(number);
-    if (client == clients_.end()) continue;
-    const StreamId id = id_of(event);
-    if (shows(client->second, id) || (event.removed() && showed(client->second, id))) {
-      client->second.output->send(frame, {});
+  news_.push_back({id_of(event), event.removed(), wire::encode_frame(response)});
+  news_bytes_ += sizeof(News) + news_.back().frame.size();
+  // The others have more to get already, and their turn comes.
+  for (const ClientNumber number : std::exchange(informed_, {})) {
+    clients_.at(number).output->request_turn();
+  }
+  if (news_bytes_ > kMaxNewsBytes || news_.size() >= 2 * kept_news_ + kStreamsPerTurn) drop_news();
+}
+
+// What all have got, and what takes too much memory: then those that are behind get it into their
+// output, which has limits of its own.
+void LocalService::drop_news() {
+  std::uint64_t needed = end_of_news();
+  std::vector<ClientNumber> behind;  // a copy: sending may end connections
+  for (const auto& [number, client] : clients_) {
+    if (!client.watch) continue;
+    needed = std::min(needed, client.watch->news);
+    if (news_bytes_ > kMaxNewsBytes) behind.push_back(number);
+  }
+  if (!behind.empty()) {
+    needed = end_of_news();
+    for (const ClientNumber number : behind) {
+      while (tell_news(number)) {
+      }
     }
   }
+  for (; first_news_ < needed; ++first_news_) {
+    news_bytes_ -= sizeof(News) + news_.front().frame.size();
+    news_.pop_front();
+  }
+  kept_news_ = news_.size();
 }
 
 void LocalService::on_stream_added(const Stream& stream) {
@@ -513,30 +576,47 @@ bool LocalService::must_wait(const local::Request& request) const {
 }
 
 void LocalService::defer(Client& client, const local::Request& request, std::size_t bytes) {
-  if (client.deferred_bytes + bytes > kMaxDeferredBytes) {
-    return send_failure(client, request.serial(),
-                        {Errc::limit_exceeded,
-                         "dssmd was restarted and waits for streams that programs give back; this "
-                         "program has 1 MiB of requests waiting already: ask again in a second"});
+  bytes += kDeferredBytes;
+  std::size_t of_user = 0;
+  for (const auto& [number, other] : clients_) {
+    if (other.identity->uid == client.identity->uid) of_user += other.deferred_bytes;
+  }
+  const bool is_full = client.deferred_bytes + bytes > kMaxDeferredBytes;
+  if (is_full || of_user + bytes > kMaxDeferredBytesPerUser) {
+    return send_failure(
+        client, request.serial(),
+        {Errc::limit_exceeded,
+         fmt::format("dssmd was restarted and waits for streams that programs give back; {} of "
+                     "requests waiting already: ask again in a second",
+                     is_full ? "this program has 1 MiB" : "this user's programs have 16 MiB")});
   }
   client.deferred_bytes += bytes;
-  deferred_.push_back({client.identity->number, request, bytes});
+  client.deferred.push_back({request, bytes});
 }
 
+// Each client's in its turn.
 void LocalService::serve_deferred() {
-  std::vector<Deferred> ready;
-  const auto still_waiting = std::stable_partition(
-      deferred_.begin(), deferred_.end(),
-      [this](const Deferred& deferred) { return must_wait(deferred.request); });
-  std::move(still_waiting, deferred_.end(), std::back_inserter(ready));
-  deferred_.erase(still_waiting, deferred_.end());
-  DescriptorQueue none;
-  for (const Deferred& deferred : ready) {
-    const auto client = clients_.find(deferred.client);
-    if (client == clients_.end()) continue;
-    client->second.deferred_bytes -= deferred.bytes;
-    serve(deferred.client, deferred.request, none);
+  for (auto& [number, client] : clients_) {
+    if (client.deferred.empty()) continue;
+    client.may_serve_deferred = true;
+    client.output->request_turn();
   }
+}
+
+// One of them. True: there may be more.
+bool LocalService::serve_deferred(ClientNumber number) {
+  Client& client = clients_.at(number);
+  if (!client.may_serve_deferred) return false;
+  const auto ready = std::find_if(client.deferred.begin(), client.deferred.end(),
+                                  [this](const Deferred& one) { return !must_wait(one.request); });
+  client.may_serve_deferred = ready != client.deferred.end();
+  if (!client.may_serve_deferred) return false;
+  const Deferred next = std::move(*ready);
+  client.deferred.erase(ready);
+  client.deferred_bytes -= next.bytes;
+  DescriptorQueue none;
+  serve(number, next.request, none);
+  return clients_.contains(number);
 }
 
 }  // namespace dssm::daemon

@@ -20,11 +20,13 @@
 #pragma once
 
 #include <cstddef>
+#include <deque>
 #include <dssm/result.hpp>
 #include <functional>
 #include <map>
 #include <memory>
 #include <optional>
+#include <set>
 #include <span>
 #include <string>
 #include <vector>
@@ -44,7 +46,7 @@ namespace dssm::daemon {
 class ClientOutput {
  public:
   virtual void send(std::string bytes, std::vector<UniqueFd> descriptors) = 0;
-  // Has LocalService::tell_streams() called, from the loop.
+  // Has LocalService::go_on() called, from the loop.
   virtual void request_turn() = 0;
 
  protected:
@@ -55,12 +57,20 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
  public:
   // Requests of one client that wait for other hosts.
   static constexpr std::size_t kMaxAwaited = 1024;
-  // What one client may have deferred during recovery.
+  // What one client, and all clients of one account, may have deferred during recovery; each
+  // request counts as so many bytes more than it has.
   static constexpr std::size_t kMaxDeferredBytes = 1U << 20;
-  // Events of existing streams for one that watches, before others get their turn: so many, or as
-  // many as begin within these bytes.
+  static constexpr std::size_t kMaxDeferredBytesPerUser = 16U << 20;
+  static constexpr std::size_t kDeferredBytes = 1U << 10;
+  // Events for one that watches, before others get their turn: so many, or as many as begin within
+  // these bytes.
   static constexpr int kStreamsPerTurn = 64;
   static constexpr std::size_t kStreamBytesPerTurn = 64U << 10;
+  // Events that wait for the turns of those that watch. Beyond that the oldest ones go into the
+  // output of each.
+  static constexpr std::size_t kMaxNewsBytes = 16U << 20;
+  // Opens of a client that has ended, before others get their turn.
+  static constexpr std::size_t kOpensPerTurn = 256;
 
   // fleet: outlives this; nullptr: there are no other hosts.
   LocalService(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock,
@@ -79,10 +89,16 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   ClientNumber connect(const Identity& identity, ClientOutput& output);
   //   by_client  the client ended the connection, or ended itself: what it had not closed before,
   //              it did not close. Otherwise dssmd ended it, and the client may connect again
-  void disconnect(ClientNumber number, bool by_client = false);
+  //   returns    whether it has more than kOpensPerTurn opens, which are still to be ended: by
+  //              leave()
+  bool disconnect(ClientNumber number, bool by_client = false);
+  // Goes on with that; again while it returns true.
+  bool leave(ClientNumber number, bool by_client) {
+    return opens_.remove_some(number, by_client, kOpensPerTurn);
+  }
   // The client has ended, or will receive nothing more. Of the requests that it sent before, those
   // are served that change something: they say which streams it closed.
-  void on_reader_gone(ClientNumber number) { clients_.at(number).has_reader = false; }
+  void on_reader_gone(ClientNumber number);
   bool has_greeted(ClientNumber number) const { return clients_.at(number).greeted; }
   std::size_t clients() const noexcept { return clients_.size(); }
 
@@ -92,10 +108,11 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   bool on_frame_untrusted(ClientNumber number, std::span<const std::byte> frame,
                           DescriptorQueue& descriptors);
 
-  // Sends some events of existing streams, if the client watches and has not got all of them. Call
-  // it as fast as the client receives, and before its further requests.
-  //   returns  whether there are more
-  bool tell_streams(ClientNumber number);
+  // Sends some of the events that the client has not got, if it watches: first of what has changed,
+  // then of existing streams; or serves one of its deferred requests. Call it as fast as the client
+  // receives, and before its further requests.
+  //   returns  whether there is more
+  bool go_on(ClientNumber number);
 
   // The rights have changed: ends opens that are not allowed any more. Their readers reopen, and
   // get the failure that says why they may not. Mirrors and remote writers end that no other
@@ -113,6 +130,17 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
     StreamId others;                     // the last one
     // By which it may know streams that it may not see any more; empty: none.
     std::vector<std::shared_ptr<const Rights>> before;
+    std::uint64_t news = 0;  // the number of the next one for it
+  };
+  // An event for all that watch. Each gets it in a turn of its own, because there may be thousands.
+  struct News {
+    StreamId stream;
+    bool is_removed = false;
+    std::string frame;
+  };
+  struct Deferred {
+    local::Request request;
+    std::size_t bytes = 0;
   };
   struct Client {
     std::shared_ptr<const ClientIdentity> identity;
@@ -120,13 +148,10 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
     bool greeted = false;
     bool has_reader = true;  // of what is sent
     std::optional<Watch> watch;
+    std::deque<Deferred> deferred;  // in the order of arrival
     std::size_t deferred_bytes = 0;
-    std::size_t awaited = 0;  // answers of other hosts
-  };
-  struct Deferred {
-    ClientNumber client = 0;
-    local::Request request;
-    std::size_t bytes = 0;
+    bool may_serve_deferred = false;  // some of them may not have to wait any more
+    std::size_t awaited = 0;          // answers of other hosts
   };
 
   bool refuse(const Client& client, std::uint64_t serial, const Error& error);
@@ -140,11 +165,15 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   void log_offer(const ClientIdentity& client, const local::Offer& offer,
                  const Result<Reply>& reply);
   void watch(ClientNumber number, std::uint64_t serial);
+  void end_watch(ClientNumber number, Client& client);
   void list_clients(const Client& client, std::uint64_t serial);
   void send(const Client& client, std::uint64_t serial, Reply reply);
   void send_failure(const Client& client, std::uint64_t serial, const Error& error);
   void broadcast(const proto::StreamEvent& event);
-  std::vector<ClientNumber> watchers() const;
+  std::uint64_t end_of_news() const noexcept { return first_news_ + news_.size(); }
+  bool tell_news(ClientNumber number);
+  void drop_news();
+  bool tell_streams(ClientNumber number);
   bool shows(const Client& client, const StreamId& id) const;
   bool showed(const Client& client, const StreamId& id) const;
   std::vector<proto::StreamEvent> next_events(Client& client) const;
@@ -153,6 +182,7 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   bool must_wait(const local::Request& request) const;
   void defer(Client& client, const local::Request& request, std::size_t bytes);
   void serve_deferred();
+  bool serve_deferred(ClientNumber number);
 
   void on_stream_added(const Stream& stream) override;
   void on_stream_described(const Stream& stream) override;
@@ -176,7 +206,11 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   Fleet* fleet_;
   ClientNumber next_client_ = 1;
   std::map<ClientNumber, Client> clients_;
-  std::vector<Deferred> deferred_;  // in the order of arrival
+  std::deque<News> news_;  // that some client has not got
+  std::uint64_t first_news_ = 0;
+  std::size_t news_bytes_ = 0, kept_news_ = 0;  // kept_news_: how many were left by drop_news()
+  std::size_t watches_ = 0;
+  std::set<ClientNumber> informed_;  // that watch and have got all of them
 };
 
 }  // namespace dssm::daemon

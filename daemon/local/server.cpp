@@ -146,7 +146,8 @@ Connection::Connection(const EventLoop& loop, UniqueFd socket, const Identity& i
 }
 
 Connection::~Connection() {
-  if (is_open()) service_.disconnect(number_);
+  if (is_open()) leaves_ = service_.disconnect(number_);
+  while (leaves_) leaves_ = service_.leave(number_, by_client_);
 }
 
 // An exception that leaves a callback would end dssmd.
@@ -226,6 +227,7 @@ bool Connection::take_descriptors(std::vector<UniqueFd> arrived) {
 }
 
 void Connection::serve_frames() {
+  if (leaves_) return leave();
   if (!turn_.may_begin()) return readable_.disable();
   const TurnQueue::Work work(turns_);
   const MonoTime begin = MonoClock::now();
@@ -234,7 +236,7 @@ void Connection::serve_frames() {
       readable_.disable();
       return turn_.wait();
     }
-    if (service_.tell_streams(number_) || !is_open()) continue;
+    if (service_.go_on(number_) || !is_open()) continue;
     const auto frame = input_.next();
     if (!frame) return end_with(frame.error());
     if (!*frame) {
@@ -352,7 +354,17 @@ void Connection::close(bool by_client) {
   arrived_.clear();
   input_share_ = {};
   output_share_ = {};
-  service_.disconnect(number_, by_client);
+  by_client_ = by_client;
+  leaves_ = service_.disconnect(number_, by_client);
+  if (leaves_) return turn_.wait();
+  on_closed_();
+}
+
+// Ends the rest of its many opens, some in each turn.
+void Connection::leave() {
+  const TurnQueue::Work work(turns_);
+  leaves_ = service_.leave(number_, by_client_);
+  if (leaves_) return turn_.wait();
   on_closed_();
 }
 

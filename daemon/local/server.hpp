@@ -159,6 +159,7 @@ class Connection final : public ClientOutput {
   void on_output_timeout();
   void end_with(const Error& error);
   void close(bool by_client = false);
+  void leave();
   bool is_open() const noexcept { return static_cast<bool>(socket_); }
   bool is_paused() const noexcept {
     return queued_descriptors_ >= kMaxQueuedDescriptors || queued_bytes_ >= kPausingBytes;
@@ -178,6 +179,8 @@ class Connection final : public ClientOutput {
   std::size_t queued_bytes_ = 0, queued_descriptors_ = 0;
   std::uint64_t sent_bytes_ = 0;
   bool has_reader_ = true;  // the client may receive what is sent
+  bool leaves_ = false;     // it is closed, and has opens that are still to be ended
+  bool by_client_ = false;  // it was closed so
   // Bytes sent, and what of them the client has not read, when output was watched last.
   using Progress = std::pair<std::uint64_t, int>;
   Progress progress() const noexcept;

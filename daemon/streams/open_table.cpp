@@ -72,22 +72,20 @@ Result<void> OpenTable::remove(ClientNumber client, OpenNumber number) {
   return {};
 }
 
-void OpenTable::remove_all(ClientNumber client, bool crashed) {
-  const auto own = by_client_.extract(client);
-  if (!own) return;
-  std::set<Stream*> written;
-  for (const OpenNumber number : own.mapped()) {
-    const OpenEntry& entry = entries_.at(number);
-    // A stream that it has open twice counts it once.
-    if (crashed && entry.role == Role::writer && written.insert(entry.stream.get()).second) {
-      entry.stream->add_crashed_writer(
-          fmt::format("{} (pid {})", entry.client->program, entry.client->pid));
-    }
-    forget(number);
+bool OpenTable::remove_some(ClientNumber client, bool crashed, std::size_t most) {
+  const auto own = by_client_.find(client);
+  if (own == by_client_.end()) return false;
+  for (; most > 0 && !own->second.empty(); --most) {
+    const OpenNumber number = *own->second.begin();
+    own->second.erase(own->second.begin());
+    forget(number, crashed);
   }
+  if (!own->second.empty()) return true;
+  by_client_.erase(own);
+  return false;
 }
 
-void OpenTable::forget(OpenNumber number) {
+void OpenTable::forget(OpenNumber number, bool crashed) {
   const OpenEntry entry = std::move(entries_.extract(number).mapped());
   const auto of_user = by_user_.find(entry.client->uid);
   if (of_user != by_user_.end() && --of_user->second == 0) by_user_.erase(of_user);
@@ -100,6 +98,11 @@ void OpenTable::forget(OpenNumber number) {
     if (--writing->second == 0) {
       of_stream->second.writing.erase(writing);
       entry.stream->remove_doorbell(entry.client->number);
+      // Once, however often it had the stream open.
+      if (crashed) {
+        entry.stream->add_crashed_writer(
+            fmt::format("{} (pid {})", entry.client->program, entry.client->pid));
+      }
     }
   }
   if (of_stream->second.opens.empty()) by_stream_.erase(of_stream);

@@ -59,8 +59,10 @@ class OpenTable {
 
   // Fails with not_found unless `number` is an open of `client`.
   Result<void> remove(ClientNumber client, OpenNumber number);
+  // Some of the client's opens, in the order of opening.
   //   crashed  the client ended without closing them: the streams that it wrote count it
-  void remove_all(ClientNumber client, bool crashed);
+  //   returns  whether there are more
+  bool remove_some(ClientNumber client, bool crashed, std::size_t most);
 
   Counts counts(const Stream& stream) const;
   bool is_writing(const Stream& stream, ClientNumber client) const;
@@ -89,7 +91,7 @@ class OpenTable {
     Counts counts;
     std::unordered_map<ClientNumber, std::uint32_t> writing;  // how many opens
   };
-  void forget(OpenNumber number);
+  void forget(OpenNumber number, bool crashed = false);
 
   Limits limits_;
   OpenNumber next_ = 1;

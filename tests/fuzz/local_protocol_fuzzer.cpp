@@ -29,7 +29,7 @@ class Sink final : public ClientOutput {
   void send(std::string bytes, std::vector<UniqueFd>) override {
     if (bytes.size() > wire::kMaxLocalFrameBytes + 10) std::abort();
   }
-  void request_turn() override {}  // there are fewer streams than are told in one
+  void request_turn() override {}  // each has one after each frame
 };
 
 struct Daemon {
@@ -53,6 +53,11 @@ void put(Daemon& daemon, ClientNumber client, const local::Request& request) {
   const std::string bytes = request.SerializeAsString();
   DescriptorQueue none;
   daemon.service.on_frame_untrusted(client, std::as_bytes(std::span(bytes)), none);
+}
+
+void take_turns(Daemon& daemon, ClientNumber client) {
+  while (daemon.service.go_on(client)) {
+  }
 }
 
 local::Request hello() {
@@ -118,12 +123,16 @@ void run(std::span<const std::uint8_t> input) {
         goes_on = frame.has_value();
         if (!frame || !*frame) break;
         goes_on = daemon.service.on_frame_untrusted(client, **frame, arrived);
+        take_turns(daemon, client);
+        take_turns(daemon, watcher);
       }
     }
   };
   receive(std::as_bytes(input), cut);
   receive(std::as_bytes(std::span(bomb)), SIZE_MAX);
   daemon.registry.end_recovery();
+  take_turns(daemon, client);
+  take_turns(daemon, watcher);
   if (cut & 1) daemon.fleet.answer();
   daemon.service.disconnect(client);
   daemon.fleet.answer();

@@ -60,7 +60,7 @@ class FakeClient final : public ClientOutput {
   void stop_reading() { service_.on_reader_gone(number_); }
   // Its turn, if it wants one; false: it needs no other one.
   bool take_turn() {
-    wants_turn = wants_turn && service_.tell_streams(number_);
+    wants_turn = wants_turn && service_.go_on(number_);
     return wants_turn;
   }
 
@@ -80,6 +80,8 @@ class FakeClient final : public ClientOutput {
   }
 
   local::Response next() {
+    while (received.empty() && take_turn()) {
+    }
     if (received.empty()) {
       ADD_FAILURE() << "nothing was sent";
       return {};

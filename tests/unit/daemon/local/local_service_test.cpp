@@ -259,26 +259,86 @@ TEST(LocalService, TellsManyStreamsInParts) {
     EXPECT_EQ(watcher.next().stream_event().stream().id().name(), name(i));
   }
 
-  // Changes come at once: of a stream that has been told, of one that has not, and of a new one.
+  // Changes come first: of a stream that has been told, of one that has not, and of a new one.
   local::Request remove;
   for (const int gone : {0, kStreams - 1}) {
     remove.mutable_remove()->mutable_id()->set_name(name(gone));
     client.ask(remove);
+  }
+  client.ask(create_request("new"));
+  EXPECT_TRUE(watcher.received.empty()) << "it was not its turn";
+  ASSERT_TRUE(watcher.take_turn());
+  EXPECT_EQ(watcher.received.size(), std::size_t{3 + LocalService::kStreamsPerTurn});
+  for (const int gone : {0, kStreams - 1}) {
     const local::Response removed = watcher.next();
     EXPECT_TRUE(removed.stream_event().removed());
     EXPECT_EQ(removed.stream_event().stream().id().name(), name(gone));
   }
-  client.ask(create_request("new"));
   EXPECT_EQ(watcher.next().stream_event().stream().id().name(), "new");
-
-  ASSERT_TRUE(watcher.take_turn());
-  EXPECT_EQ(watcher.received.size(), std::size_t{LocalService::kStreamsPerTurn});
   EXPECT_FALSE(watcher.take_turn());
   for (int i = LocalService::kStreamsPerTurn; i < kStreams - 1; ++i) {
     EXPECT_EQ(watcher.next().stream_event().stream().id().name(), name(i));
   }
   EXPECT_EQ(watcher.next().stream_event().stream().id().name(), "new");
   EXPECT_EQ(watcher.next().serial(), 2u) << "the answer, when all has been told";
+  EXPECT_TRUE(watcher.received.empty());
+}
+
+// There may be thousands that watch, and one that changes something must not stop all others.
+TEST(LocalService, TellsEachWatchOfChangesInItsTurn) {
+  LocalDaemon daemon;
+  FakeClient client(daemon.service, 5), one(daemon.service, 6), other(daemon.service, 7);
+  local::Request watch, set;
+  watch.mutable_watch();
+  for (FakeClient* each : {&client, &one, &other}) EXPECT_TRUE(each->greet().ask(watch).has_done());
+  EXPECT_TRUE(client.ask(create_request("a")).has_stream_event()) << "of its own change, too";
+  EXPECT_TRUE(client.next().has_opened()) << "the answer comes after the event";
+  set.mutable_set_property()->mutable_id()->set_name("a");
+  set.mutable_set_property()->set_property("x");
+  constexpr int kTimes = LocalService::kStreamsPerTurn;
+  for (int i = 0; i < kTimes; ++i) {
+    EXPECT_TRUE(client.ask(set).has_stream_event());
+    EXPECT_TRUE(client.next().has_done());
+  }
+  EXPECT_TRUE(one.wants_turn);
+  EXPECT_TRUE(one.received.empty());
+  EXPECT_TRUE(one.take_turn()) << "one more";
+  EXPECT_EQ(one.received.size(), std::size_t{kTimes});
+  EXPECT_FALSE(one.take_turn());
+  EXPECT_EQ(one.received.size(), std::size_t{kTimes + 1});
+  EXPECT_FALSE(one.next().stream_event().property_set());
+  EXPECT_TRUE(one.next().stream_event().property_set());
+  EXPECT_TRUE(other.received.empty());
+}
+
+// The queue of a connection has a limit of its own.
+TEST(LocalService, KeepsFewChangesForWatchesThatDoNotTakeThem) {
+  LocalDaemon daemon;
+  FakeClient client(daemon.service, 5), watcher(daemon.service, 6);
+  local::Request watch, set;
+  watch.mutable_watch();
+  client.greet();
+  EXPECT_TRUE(watcher.greet().ask(watch).has_done());
+  local::Request create = create_request("long");
+  proto::Type& type = *create.mutable_create()->mutable_type();
+  const proto::Field field = type.fields(0);
+  for (int more = 0; more < 1000; ++more) {
+    *type.add_fields() = field;
+    type.mutable_fields(type.fields_size() - 1)->set_name("f" + std::to_string(more));
+  }
+  ASSERT_TRUE(client.ask(create).has_opened());
+  set.mutable_set_property()->mutable_id()->set_name("long");
+  std::size_t events = 1;
+  for (; watcher.received.empty(); ++events) {
+    ASSERT_LT(events, LocalService::kMaxNewsBytes / 1000) << "each has more than 1000 bytes";
+    EXPECT_TRUE(client.ask(set).has_done());
+  }
+  EXPECT_EQ(watcher.received.size(), events) << "all, in their order";
+  EXPECT_FALSE(watcher.received.front().stream_event().property_set());
+  watcher.received.clear();
+  EXPECT_FALSE(watcher.take_turn());
+  EXPECT_TRUE(client.ask(set).has_done());
+  EXPECT_TRUE(watcher.next().stream_event().property_set());
   EXPECT_TRUE(watcher.received.empty());
 }
 
@@ -661,6 +721,72 @@ TEST(LocalService, BoundsWhatOneClientHasWaiting) {
     ASSERT_TRUE(client.put(create));
   }
   EXPECT_EQ(client.next().failure().code(), "limit_exceeded");
+}
+
+// Each request counts as more than its few bytes.
+TEST(LocalService, BoundsWhatOneUserHasWaiting) {
+  LocalDaemon daemon(true);
+  constexpr std::size_t kFew = LocalService::kMaxDeferredBytes / LocalService::kDeferredBytes / 2;
+  constexpr std::size_t kPrograms =
+      2 * LocalService::kMaxDeferredBytesPerUser / LocalService::kMaxDeferredBytes;
+  std::deque<FakeClient> clients;
+  local::Request create = create_request("odometry");
+  do {
+    FakeClient& client = clients.emplace_back(daemon.service, 6).greet();
+    for (std::uint64_t serial = 50; serial < 50 + kFew; ++serial) {
+      create.set_serial(serial);
+      ASSERT_TRUE(client.put(create));
+    }
+  } while (clients.back().received.empty() && clients.size() <= kPrograms);
+  EXPECT_GE(clients.size(), kPrograms * 3 / 4);
+  EXPECT_NE(clients.back().next().failure().message().find("16 MiB"), std::string::npos);
+}
+
+TEST(LocalService, AnswersWhatWaitsInTurns) {
+  LocalDaemon daemon(true);
+  FakeClient client(daemon.service, 6);
+  client.greet();
+  local::Request create = create_request("odometry");
+  for (std::uint64_t serial = 50; serial < 53; ++serial) {
+    create.set_serial(serial);
+    ASSERT_TRUE(client.put(create));
+  }
+  daemon.registry.end_recovery();
+  for (std::size_t answered = 1; answered <= 3; ++answered) {
+    EXPECT_TRUE(client.take_turn());
+    EXPECT_EQ(client.received.size(), answered);
+  }
+  EXPECT_FALSE(client.take_turn());
+}
+
+// A program may have thousands of streams open.
+TEST(LocalService, EndsTheOpensOfAClientThatLeavesInParts) {
+  LocalDaemon daemon(false, {10'000, 10'000});
+  class Output final : public ClientOutput {
+    void send(std::string /*bytes*/, std::vector<UniqueFd> /*descriptors*/) override {}
+    void request_turn() override {}
+  } output;
+  const ClientNumber number = daemon.service.connect({}, output);
+  auto put = [&, serial = 1U](local::Request request) mutable {
+    request.set_serial(serial++);
+    const std::string bytes = request.SerializeAsString();
+    DescriptorQueue none;
+    ASSERT_TRUE(daemon.service.on_frame_untrusted(number, std::as_bytes(std::span(bytes)), none));
+  };
+  local::Request hello;
+  hello.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);
+  put(hello);
+  put(create_request("a"));
+  for (std::size_t i = 0; i < 2 * LocalService::kOpensPerTurn; ++i) put(open_request("a"));
+  const Stream& stream = **daemon.registry.find({"a", 0, ""});
+  EXPECT_EQ(daemon.opens.counts(stream).readers, 2 * LocalService::kOpensPerTurn);
+  EXPECT_TRUE(daemon.service.disconnect(number, true));
+  EXPECT_EQ(daemon.opens.counts(stream).writers, 0u);
+  EXPECT_EQ(daemon.opens.counts(stream).readers, LocalService::kOpensPerTurn + 1);
+  EXPECT_TRUE(daemon.service.leave(number, true));
+  EXPECT_FALSE(daemon.service.leave(number, true));
+  EXPECT_TRUE(daemon.opens.entries().empty());
+  EXPECT_EQ(stream.info().crashed_writers, 1u);
 }
 
 TEST(LocalService, DelaysRequestsForAPlaybackClockThatMayStillBeOffered) {

@@ -472,6 +472,7 @@ TEST_F(RecoveringRequestsTest, DoNotWaitWhenTheyNameAnotherHost) {
   put(open_request("lidar"), 81);
   EXPECT_EQ(fleet.asked, Asked{"open_reader lidar:0@pc2"}) << "the other may be ours";
   registry.end_recovery();
+  client->take_turn();
   EXPECT_EQ(fleet.asked, (Asked{"open_reader lidar:0@pc2", "open_reader lidar:0"}));
 }
 

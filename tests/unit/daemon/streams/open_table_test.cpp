@@ -44,11 +44,11 @@ TEST_F(OpenTableTest, ForgetsAllOfAClientThatLeft) {
   table_.add({client(1), a, Role::writer, 0});
   table_.add({client(1), a, Role::reader, 0});
   table_.add({client(2), a, Role::reader, 0});
-  table_.remove_all(1, false);
+  EXPECT_FALSE(table_.remove_some(1, false, 100));
   EXPECT_EQ(table_.entries().size(), 1u);
   EXPECT_EQ(table_.counts(*a).writers, 0u);
   EXPECT_EQ(table_.counts(*a).readers, 1u);
-  table_.remove_all(1, false);
+  EXPECT_FALSE(table_.remove_some(1, false, 100));
   EXPECT_EQ(table_.entries().size(), 1u);
 }
 
@@ -61,12 +61,12 @@ TEST_F(OpenTableTest, CountsWritersThatCrashedOnceForEachStreamThatTheyWrote) {
   const OpenNumber closed = table_.add({client(1), c, Role::writer, 0});
   table_.add({client(2), a, Role::writer, 0});
   ASSERT_TRUE(table_.remove(1, closed));
-  table_.remove_all(1, true);
+  EXPECT_FALSE(table_.remove_some(1, true, 100));
   EXPECT_EQ(a->info().crashed_writers, 1u);
   EXPECT_EQ(a->info().last_crashed_writer, client(1)->program + " (pid 1001)");
   EXPECT_EQ(b->info().crashed_writers, 0u);
   EXPECT_EQ(c->info().crashed_writers, 0u);
-  table_.remove_all(2, false);
+  EXPECT_FALSE(table_.remove_some(2, false, 100));
   EXPECT_EQ(a->info().crashed_writers, 1u);
 }
 
