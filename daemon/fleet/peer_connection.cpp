@@ -49,7 +49,12 @@ PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver,
       self_(options.self),
       observer_(observer),
       status_{.since = loop.now()},
-      heartbeat_(EventSource::timer(loop, [this] { beat(); })),
+      heartbeat_(EventSource::timer(loop,
+                                    [this] {
+                                      may_repeat_ =
+                                          loop_.now() - their_beat_at_ <= wire::kHeartbeat * 3 / 2;
+                                      beat();
+                                    })),
       dialer_(loop, resolver, std::move(options), *this) {}
 
 PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver, const wire::Address& peer,
@@ -172,7 +177,10 @@ void PeerConnection::start_heartbeat() {
 }
 
 void PeerConnection::on_their_heartbeat() {
-  if (beat_at_ != MonoTime() && loop_.now() - beat_at_ >= wire::kHeartbeat / 2) beat();
+  their_beat_at_ = loop_.now();
+  if (beat_at_ == MonoTime() || their_beat_at_ - beat_at_ < wire::kHeartbeat / 2) return;
+  may_repeat_ = false;
+  beat();
 }
 
 // Called every kHeartbeat, or when the peer timeout is over, whichever is first. This is where a
@@ -189,17 +197,20 @@ void PeerConnection::beat() {
          fmt::format("no bytes came from host '{}' ('{}') for {} ms", them_->host, address(),
                      std::chrono::duration_cast<std::chrono::milliseconds>(silent).count())});
   }
+  beat_at_ = now;
+  ping();
+  heartbeat_.enable_in(std::min(wire::kHeartbeat, timeout - silent));
+}
+
+void PeerConnection::ping() {
   net::Frame request;
   net::Ping& ping = *request.mutable_ping();
   wire::send_clock(self_, *ping.mutable_clock());
   ping.set_answered_ns(to_ns(std::exchange(answered_, {})));
-  beat_at_ = now;
   asked_ = RawClock::now();
   ping.set_raw_ns(to_ns(asked_));
-  ask(std::move(request), [this, now, asked = asked_](const Result<net::Frame>& answer) {
-    on_pong(now, asked, answer);
-  });
-  heartbeat_.enable_in(std::min(wire::kHeartbeat, timeout - silent));
+  ask(std::move(request), [this, now = loop_.now(), asked = asked_](
+                              const Result<net::Frame>& answer) { on_pong(now, asked, answer); });
 }
 
 void PeerConnection::take_clock(std::shared_ptr<const wire::ClockReport> clock) {
@@ -222,6 +233,8 @@ void PeerConnection::on_pong(MonoTime asked, RawTime asked_raw, const Result<net
   clock.heartbeat = {asked_raw, RawTime(Duration(received_ns)), RawTime(Duration(pong.raw_ns())),
                      answered};
   take_clock(std::make_shared<const wire::ClockReport>(std::move(clock)));
+  const bool is_late = took > round_trips_.min * 5 / 4;
+  if (std::exchange(may_repeat_, false) && is_late && dialer_.connection()) ping();
 }
 
 // When what was read at `read` came.

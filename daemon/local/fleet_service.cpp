@@ -162,11 +162,10 @@ FleetService::FleetService(const EventLoop& loop, Self self, const Registry& reg
       peers_(peers),
       mirrors_(mirrors),
       writers_(writers),
-      list_timer_(EventSource::timer(loop, [this] { on_list_timeout(); })) {
+      list_timer_(EventSource::timer(loop, [this] { on_list_timeout(); })),
+      early_turn_(EventSource::timer(loop, [this] { answer_early(); })) {
   catalog_.add_observer(*this);
-  peers_.on_startup_over([this] {
-    for (const std::function<void()>& go_on : std::exchange(early_, {})) go_on();
-  });
+  peers_.on_startup_over([this] { answer_early(); });
 }
 
 FleetService::~FleetService() {
@@ -177,10 +176,23 @@ FleetService::~FleetService() {
 // --- finding owners
 
 // Continues when the owner of `id` is known, or when it is clear that there is none.
-void FleetService::when_known(const StreamId& id, std::function<void()> go_on) {
+//   bytes  that wait meanwhile
+void FleetService::when_known(const StreamId& id, std::size_t bytes, std::function<void()> go_on) {
   const bool known = !id.host.empty() && catalog_.find_host(id.host);
-  if (known || peers_.startup_is_over() || early_.size() >= kMaxEarlyRequests) return go_on();
-  early_.push_back(std::move(go_on));
+  const bool is_full = early_.size() >= kMaxEarlyRequests || early_bytes_ + bytes > kMaxEarlyBytes;
+  if (known || peers_.startup_is_over() || is_full) return go_on();
+  early_.push_back({std::move(go_on), bytes});
+  early_bytes_ += bytes;
+}
+
+void FleetService::answer_early() {
+  for (int answered = 0; answered < kEarlyPerTurn && !early_.empty(); ++answered) {
+    const Early next = std::move(early_.front());
+    early_.pop_front();
+    early_bytes_ -= next.bytes;
+    next.go_on();
+  }
+  if (!early_.empty()) early_turn_.enable_in(Duration::zero());
 }
 
 // What is not found may be at a peer that is unavailable.
@@ -203,7 +215,7 @@ Mirror* FleetService::mirror_without_owner(const StreamId& id) const {
 
 void FleetService::open_reader(const StreamId& id, bool history, const std::string& account,
                                Then<std::shared_ptr<Stream>> then) {
-  when_known(id, [this, id, history, account, then = std::move(then)]() mutable {
+  when_known(id, 0, [this, id, history, account, then = std::move(then)]() mutable {
     const Result<const KnownHost*> owner = catalog_.find_owner(id);
     if (owner) {
       const StreamId named = owned_by(**owner, id);
@@ -236,7 +248,9 @@ void FleetService::want_history(const StreamId& id, bool always) {
 void FleetService::open_writer(const StreamId& id, const CreatePlan* plan,
                                const std::string& account, Then<OpenedRing> then) {
   const std::optional<CreatePlan> kept = plan ? std::optional(*plan) : std::nullopt;
-  when_known(id, [this, id, kept, account, then = std::move(then)]() mutable {
+  // Names of fields are short.
+  const std::size_t bytes = plan ? plan->type.fields.size() * sizeof(Field) : 0;
+  when_known(id, bytes, [this, id, kept, account, then = std::move(then)]() mutable {
     const Result<const KnownHost*> owner = catalog_.find_owner(id);
     if (!owner) return then(with_unavailable_peers(owner.error()));
     writers_.open(**owner, id, kept ? &*kept : nullptr, std::move(then), account);
@@ -264,7 +278,7 @@ std::optional<local::Response> FleetService::describe_mirror(const StreamId& id)
 
 void FleetService::forward(const StreamId& id, const local::Request& request,
                            Then<local::Response> then) {
-  when_known(id, [this, id, request, then = std::move(then)]() mutable {
+  when_known(id, request.ByteSizeLong(), [this, id, request, then = std::move(then)]() mutable {
     const Result<const KnownHost*> owner = catalog_.find_owner(id);
     if (!owner) {
       // Info of a mirror whose owner is unavailable comes from here.
@@ -516,7 +530,7 @@ local::Mdns FleetService::mdns() const {
 }
 
 void FleetService::ping(const std::string& host, Then<local::RoundTrip> then) {
-  when_known({"", 0, host}, [this, host, then = std::move(then)]() mutable {
+  when_known({"", 0, host}, 0, [this, host, then = std::move(then)]() mutable {
     const Result<const KnownHost*> known = catalog_.find_host(host);
     if (!known) return then(with_unavailable_peers(known.error()));
     PeerConnection& link = *peers_.connection_to((*known)->greeting.host_id);

@@ -33,6 +33,9 @@ class FleetService final : public Fleet, private CatalogObserver {
  public:
   // Requests that wait until the peers are heard of or tried; more fail at once.
   static constexpr std::size_t kMaxEarlyRequests = 4096;
+  static constexpr std::size_t kMaxEarlyBytes = 16U << 20;  // of the requests themselves
+  // Of them that are answered before others get their turn.
+  static constexpr int kEarlyPerTurn = 16;
 
   // What the list of hosts shows of this one.
   struct Self {
@@ -92,7 +95,8 @@ class FleetService final : public Fleet, private CatalogObserver {
 
   Result<local::Response> response_to(local::Request::BodyCase request, const StreamId& id,
                                       net::Frame answer) const;
-  void when_known(const StreamId& id, std::function<void()> go_on);
+  void when_known(const StreamId& id, std::size_t bytes, std::function<void()> go_on);
+  void answer_early();
   Error with_unavailable_peers(Error error) const;
   Mirror* mirror_without_owner(const StreamId& id) const;
   std::optional<local::Response> describe_mirror(const StreamId& id) const;
@@ -115,9 +119,15 @@ class FleetService final : public Fleet, private CatalogObserver {
   RemoteStreams<Mirror>& mirrors_;
   RemoteStreams<RemoteWriter>& writers_;
   Fleet::Observer* observer_ = nullptr;
-  std::vector<std::function<void()>> early_;       // wait for the peers to settle
+  // A request that waits for the peers to settle.
+  struct Early {
+    std::function<void()> go_on;
+    std::size_t bytes = 0;
+  };
+  std::deque<Early> early_;  // in the order of arrival
+  std::size_t early_bytes_ = 0;
   std::deque<std::shared_ptr<Listing>> listings_;  // in the order of their deadlines
-  EventSource list_timer_;
+  EventSource list_timer_, early_turn_;
 };
 
 }  // namespace dssm::daemon

@@ -177,6 +177,29 @@ TEST_F(PeersTest, BeatWithTheOtherHost) {
   EXPECT_EQ(loop.now() - begin, wire::kHeartbeat * 7 / 4) << "a second after the last one";
 }
 
+TEST_F(PeersTest, RepeatAHeartbeatOnceThatWasAnsweredLate) {
+  start({&one});
+  one.delay = std::chrono::milliseconds(1);
+  wait([&] { return one.pings >= 3; });
+  const auto next_second = [&](bool do_they_beat) {
+    if (do_they_beat) peers->connection_to(one.host().greeting.host_id)->on_their_heartbeat();
+    const int before = one.pings;
+    wait([&] { return one.pings > before; });
+    const MonoTime begin = loop.now();
+    bool is_over = false;
+    EventSource over = EventSource::timer(loop, [&] { is_over = true; });
+    over.enable_in(wire::kHeartbeat / 4);
+    wait([&] { return is_over; });
+    EXPECT_EQ(loop.now() - begin, wire::kHeartbeat / 4);
+    return one.pings - before;
+  };
+  EXPECT_EQ(next_second(true), 1) << "as fast as the fastest";
+  one.delay = std::chrono::milliseconds(10);
+  EXPECT_EQ(next_second(true), 2);
+  EXPECT_EQ(next_second(false), 1) << "a second later they have sent none";
+  EXPECT_EQ(next_second(false), 1);
+}
+
 TEST_F(PeersTest, RefuseAPeerThatSendsInvalidStreamEvents) {
   start({&one});
   wait_for_startup();

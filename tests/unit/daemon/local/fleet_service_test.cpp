@@ -53,6 +53,37 @@ TEST_F(FleetServiceTest, ReportsThatMdnsIsOffUntilItsFirstState) {
   EXPECT_FALSE(shown.own_host_seen());
 }
 
+TEST_F(FleetServiceTest, AnswersWhatWaitedForThePeersInTurns) {
+  constexpr int kRequests = 3 * FleetService::kEarlyPerTurn;
+  int answered = 0, before = 0, most = 0;
+  local::Request request;
+  request.mutable_info();
+  for (int i = 0; i < kRequests; ++i) {
+    fleet->forward({"nothing", 0, ""}, request, [&](const Result<local::Response>& answer) {
+      EXPECT_FALSE(answer);
+      ++answered;
+    });
+  }
+  EXPECT_EQ(answered, 0);
+  run_until(loop, [&] {
+    most = std::max(most, answered - std::exchange(before, answered));
+    return answered == kRequests;
+  });
+  EXPECT_EQ(most, FleetService::kEarlyPerTurn);
+}
+
+TEST_F(FleetServiceTest, BoundsWhatWaitsForThePeers) {
+  std::size_t requests = 0;
+  bool is_answered = false;
+  local::Request request;
+  request.mutable_set_property()->set_property(std::string(1U << 20, 'x'));
+  for (; !is_answered && requests < 100; ++requests) {
+    fleet->forward({"nothing", 0, ""}, request,
+                   [&](const Result<local::Response>&) { is_answered = true; });
+  }
+  EXPECT_EQ(requests, FleetService::kMaxEarlyBytes >> 20);
+}
+
 TEST_F(FleetServiceTest, ReportsTheNewestStateOfMdns) {
   MdnsInfo state;
   state.phase = MdnsPhase::waiting;
