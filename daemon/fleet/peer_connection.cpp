@@ -49,12 +49,7 @@ PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver,
       self_(options.self),
       observer_(observer),
       status_{.since = loop.now()},
-      heartbeat_(EventSource::timer(loop,
-                                    [this] {
-                                      may_repeat_ =
-                                          loop_.now() - their_beat_at_ <= wire::kHeartbeat * 3 / 2;
-                                      beat();
-                                    })),
+      heartbeat_(EventSource::timer(loop, [this] { beat(); })),
       dialer_(loop, resolver, std::move(options), *this) {}
 
 PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver, const wire::Address& peer,
@@ -178,14 +173,12 @@ void PeerConnection::start_heartbeat() {
 
 void PeerConnection::on_their_heartbeat() {
   their_beat_at_ = loop_.now();
-  if (beat_at_ == MonoTime() || their_beat_at_ - beat_at_ < wire::kHeartbeat / 2) return;
-  may_repeat_ = false;
-  beat();
+  if (beat_at_ != MonoTime() && their_beat_at_ - beat_at_ >= wire::kHeartbeat / 2) beat(true);
 }
 
 // Called every kHeartbeat, or when the peer timeout is over, whichever is first. This is where a
 // peer that does not answer any more counts as dead (peers.hpp).
-void PeerConnection::beat() {
+void PeerConnection::beat(bool follows_theirs) {
   FrameConnection* link = dialer_.connection();
   if (!link) return;
   const MonoTime now = loop_.now();
@@ -198,6 +191,7 @@ void PeerConnection::beat() {
                      std::chrono::duration_cast<std::chrono::milliseconds>(silent).count())});
   }
   beat_at_ = now;
+  follows_theirs_ = follows_theirs;
   ping();
   heartbeat_.enable_in(std::min(wire::kHeartbeat, timeout - silent));
 }
@@ -233,8 +227,14 @@ void PeerConnection::on_pong(MonoTime asked, RawTime asked_raw, const Result<net
   clock.heartbeat = {asked_raw, RawTime(Duration(received_ns)), RawTime(Duration(pong.raw_ns())),
                      answered};
   take_clock(std::make_shared<const wire::ClockReport>(std::move(clock)));
+  const MonoTime now = loop_.now();
+  const bool do_they_beat = now - their_beat_at_ <= wire::kHeartbeat * 3 / 2;
   const bool is_late = took > round_trips_.min * 5 / 4;
-  if (std::exchange(may_repeat_, false) && is_late && dialer_.connection()) ping();
+  if (do_they_beat && !follows_theirs_ && is_late && now - repeated_at_ >= kRepeat &&
+      dialer_.connection()) {
+    repeated_at_ = now;
+    ping();
+  }
 }
 
 // When what was read at `read` came.

@@ -26,6 +26,9 @@ class PeerConnection final : private Dialer::Observer {
   static constexpr std::size_t kMaxWaiting = 4096;
   static constexpr std::size_t kMaxWaitingBytes = 3U << 20;  // two properties of the largest size
 
+  // From a repeated heartbeat to the next one that is repeated.
+  static constexpr Duration kRepeat = wire::kHeartbeat * 7 / 2;
+
   // A found host that answers again is back within kFoundRoundTime + ConnectPlan::kMaxPause,
   // whichever of its addresses are dead; the design allows 3 s.
   static constexpr Duration kFoundRoundTime = std::chrono::milliseconds(1500);
@@ -74,8 +77,8 @@ class PeerConnection final : private Dialer::Observer {
   void start_heartbeat();
   // The peer's own heartbeat came: both PCs are awake, so that this one's is answered sooner now
   // than at any other time. Sent if half of its second has passed. While the peer sends some, too,
-  // one that was not sent so, and was answered late, is repeated: that takes no more wake-ups than
-  // if each host sent its own at a time of its own.
+  // one that was not sent so, and was answered late, is repeated, each fourth at most: so both wake
+  // up about as often as if each sent its own at another time.
   void on_their_heartbeat();
 
   // Closes the connection and dials again later.
@@ -135,7 +138,7 @@ class PeerConnection final : private Dialer::Observer {
   void on_up(FrameConnection& link, const wire::Greeting& them) override;
   Result<void> on_frame(net::Frame& frame) override;
   void on_down(const Error& error) override;
-  void beat();
+  void beat(bool follows_theirs = false);
   void ping();
   void take_clock(std::shared_ptr<const wire::ClockReport> clock);
   void on_pong(MonoTime asked, RawTime asked_raw, const Result<net::Frame>& answer);
@@ -153,8 +156,8 @@ class PeerConnection final : private Dialer::Observer {
   Status status_;
   std::optional<wire::Greeting> them_;
   RoundTrips round_trips_;
-  MonoTime beat_at_{}, their_beat_at_{};
-  bool may_repeat_ = false;  // the last heartbeat
+  MonoTime beat_at_{}, their_beat_at_{}, repeated_at_{};
+  bool follows_theirs_ = false;  // the last heartbeat
   RawTime asked_{}, answered_{};  // the last heartbeat; answered_ 0: not yet
   std::uint64_t carried_bytes_per_s_ = 0;
   bool watching_ = false;

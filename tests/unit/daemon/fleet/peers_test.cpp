@@ -196,8 +196,9 @@ TEST_F(PeersTest, RepeatAHeartbeatOnceThatWasAnsweredLate) {
   EXPECT_EQ(next_second(true), 1) << "as fast as the fastest";
   one.delay = std::chrono::milliseconds(10);
   EXPECT_EQ(next_second(true), 2);
-  EXPECT_EQ(next_second(false), 1) << "a second later they have sent none";
-  EXPECT_EQ(next_second(false), 1);
+  for (int i = 0; i < 3; ++i) EXPECT_EQ(next_second(true), 1) << "too soon for another one";
+  EXPECT_EQ(next_second(true), 2);
+  for (int i = 0; i < 5; ++i) EXPECT_EQ(next_second(false), 1) << "they send none";
 }
 
 TEST_F(PeersTest, RefuseAPeerThatSendsInvalidStreamEvents) {
