@@ -124,12 +124,12 @@ Result<void> LocalService::check_access(const Client& client, const local::Reque
   if (const proto::StreamId* named = LocalRequests::subject(request)) {
     stream = {named->name(), named->id(), named->host()};
   }
-  // An existing stream is only opened; a program that could not get memory for its new stream
-  // removes it.
-  const bool is_opened = *action == Action::create && exists(stream);
+  // A program that could not get memory for its new stream removes it.
   if (*action == Action::remove && is_only_user(client, stream)) return {};
   Result<void> checked =
-      rights_.check(*client.identity, is_opened ? Action::open_for_writing : *action, stream);
+      *action == Action::create
+          ? rights_.check_create(*client.identity, stream, exists(stream), Action::open_for_writing)
+          : rights_.check(*client.identity, *action, stream);
   if (!checked) {
     refusals_.warning("refuse a request: " + checked.error().message,
                       {.stream = stream.str(),

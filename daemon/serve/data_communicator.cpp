@@ -202,8 +202,11 @@ Result<void> DataCommunicator::check_access(const net::Frame& request) {
   } else if (const proto::StreamId* named = subject(request)) {
     stream = {named->name(), named->id(), named->host()};
   }
-  const bool exists = *action == Action::create && parts_.registry.knows(stream);
-  Result<void> checked = parts_.rights.check(identity_, exists ? Action::publish : *action, stream);
+  Result<void> checked =
+      *action == Action::create
+          ? parts_.rights.check_create(identity_, stream, parts_.registry.knows(stream),
+                                       Action::publish)
+          : parts_.rights.check(identity_, *action, stream);
   if (!checked) {
     parts_.logger.warning(
         "refuse a request: " + checked.error().message,

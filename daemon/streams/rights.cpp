@@ -171,6 +171,14 @@ Result<void> Rights::check(const Identity& identity, Action action, const Stream
                            in_quotes(stream.str().substr(0, kMaxFullNameBytes)), fix)};
 }
 
+Result<void> Rights::check_create(const Identity& identity, const StreamId& stream, bool exists,
+                                  Action write) const {
+  Result<void> created = check(identity, Action::create, stream);
+  if (!exists) return created;
+  Result<void> written = check(identity, write, stream);
+  return written || created ? written : created;
+}
+
 bool Rights::shows(const Identity& identity, const StreamId& stream) const {
   return lines_.empty() || verbs(identity, stream).has_any(needed_for(Action::see));
 }

@@ -43,6 +43,10 @@ class Rights {
   //            without a name: none
   //   fails    no_permission
   virtual Result<void> check(const Identity& identity, Action action, const StreamId& stream) const;
+  // The same for a request to create a stream, which opens it for writing, by the action `write`,
+  // if it exists. Who may do neither gets the same failure whether it exists or not.
+  Result<void> check_create(const Identity& identity, const StreamId& stream, bool exists,
+                            Action write) const;
 
   // What all lines for `identity` together allow with `stream`.
   Verbs verbs(const Identity& identity, const StreamId& stream) const;

@@ -3,7 +3,6 @@
 // 100 streams that are read on another host and not written: how often the two dssmd wake up,
 // compared with the heartbeats of one control connection, which are the only allowed reason.
 #include <dssm/dssm.hpp>
-#include <fstream>
 #include <string>
 
 #include "tests/bench/harness.hpp"
@@ -12,20 +11,6 @@
 using namespace dssm;
 using namespace dssm::bench;
 using namespace std::chrono_literals;
-
-namespace {
-
-// How often the process went to sleep, which is the number of its wake-ups.
-std::int64_t sleeps(pid_t pid) {
-  std::ifstream status("/proc/" + std::to_string(pid) + "/status");
-  for (std::string word; status >> word;) {
-    std::int64_t count = 0;
-    if (word == "voluntary_ctxt_switches:" && status >> count) return count;
-  }
-  fail("read /proc");
-}
-
-}  // namespace
 
 int main() {
   constexpr int kStreams = 100, kSeconds = 10;
@@ -41,10 +26,10 @@ int main() {
     readers.push_back(there.await_raw_reader(id, deadline_in(10s)).value());
   }
   ::sleep(1);
-  const std::int64_t owner_before = sleeps(owner->pid()), other_before = sleeps(other->pid());
+  const std::int64_t owner_before = sleeps_of(owner->pid()), other_before = sleeps_of(other->pid());
   ::sleep(kSeconds);
-  const double owner_rate = static_cast<double>(sleeps(owner->pid()) - owner_before) / kSeconds;
-  const double other_rate = static_cast<double>(sleeps(other->pid()) - other_before) / kSeconds;
+  const double owner_rate = static_cast<double>(sleeps_of(owner->pid()) - owner_before) / kSeconds;
+  const double other_rate = static_cast<double>(sleeps_of(other->pid()) - other_before) / kSeconds;
   std::printf("100 remote streams, without writers      wake-ups a second  heartbeats\n");
   std::printf("  owner: a Ping a second arrives         %17.1f  1\n", owner_rate);
   std::printf("  mirrors: sends it, and gets the Pong   %17.1f  2\n", other_rate);

@@ -21,7 +21,9 @@
 #include <cstdio>
 #include <cstdlib>
 #include <dssm/time.hpp>
+#include <fstream>
 #include <new>
+#include <string>
 #include <utility>
 
 namespace dssm::bench {
@@ -55,6 +57,16 @@ pid_t in_child(Work work) {
 inline void end_child(pid_t pid) {
   ::kill(pid, SIGKILL);
   ::waitpid(pid, nullptr, 0);
+}
+
+// How often the process went to sleep, which is the number of its wake-ups.
+inline std::int64_t sleeps_of(pid_t pid) {
+  std::ifstream status("/proc/" + std::to_string(pid) + "/status");
+  for (std::string word; status >> word;) {
+    std::int64_t count = 0;
+    if (word == "voluntary_ctxt_switches:" && status >> count) return count;
+  }
+  fail("read /proc");
 }
 
 inline void sleep_until(MonoTime time) {

@@ -99,7 +99,7 @@ struct ClockPair {
   Duration chain = kUnknownClockError;  // by what chronyd states on both; unknown for one clock
   // By heartbeats, the greatest of the last seconds; unknown for one clock.
   Duration measured = kUnknownClockError;
-  Duration round_trip{};  // the shortest of the last 64 heartbeats; 0: not measured
+  Duration round_trip{};  // the shortest of the reader's heartbeats in 64 s; 0: not measured
   Duration limit{};       // clock_limit of the reader, the greatest good `bound`
   std::string error;      // why none of this is known, in a sentence, for people; empty: it is
 

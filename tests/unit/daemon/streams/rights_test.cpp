@@ -243,6 +243,17 @@ TEST_F(LocalRightsTest, AnExistingStreamTakesOnlyTheRightToWrite) {
   EXPECT_EQ(client.ask(daemon::create_request("camera")).failure().code(), "no_permission");
 }
 
+TEST_F(LocalRightsTest, WhoMayNotSeeAStreamDoesNotLearnWhetherItExists) {
+  ASSERT_TRUE(registry.create({"secret", 0, ""}, odometry_type(), {16, Duration(1)}, 1));
+  set({"user:1000 read,create public*"});
+  const auto refusal = [&](const std::string& name) {
+    const std::string text = client.ask(daemon::create_request(name)).failure().message();
+    EXPECT_NE(text.find(name), std::string::npos) << text;
+    return text.substr(0, text.find(name));
+  };
+  EXPECT_EQ(refusal("secret"), refusal("nothing"));
+}
+
 TEST_F(LocalRightsTest, AStreamIsReplacedByWhoMayCreateAndRemoveIt) {
   local::Request longer = daemon::create_request("lidar");
   longer.mutable_create()->set_depth(17);
