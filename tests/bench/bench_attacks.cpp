@@ -125,6 +125,12 @@ class Hostile {
     }
     return static_cast<bool>(fd_);
   }
+  // What has come.
+  void receive_some() {
+    static std::vector<char> space(1U << 16);
+    while (fd_ && ::recv(fd_.get(), space.data(), space.size(), MSG_DONTWAIT) > 0) {
+    }
+  }
   void leave() { fd_.reset(); }
 
  private:
@@ -213,6 +219,24 @@ const std::vector<Attack>& attacks() {
          const std::string frame = local_frame(set_property<local::Request>);
          Hostile hostile = Hostile::local(socket);
          for (;;) hostile.send(frame);
+       }},
+      {"500 programs watch, one sets properties",
+       [](const std::string& socket, const std::string&) {
+         const std::string frame = local_frame([](local::Request& request) {
+           request.mutable_set_property()->mutable_id()->set_name("s0");
+           request.mutable_set_property()->set_property("p");
+         });
+         Hostile hostile = Hostile::local(socket);
+         std::vector<Hostile> many;
+         for (int i = 0; i < 500; ++i) {
+           many.push_back(Hostile::local(socket));
+           many.back().send(watch);
+         }
+         for (;;) {
+           for (int i = 0; i < 16; ++i) hostile.send(frame);
+           for (Hostile& one : many) one.receive_some();
+           hostile.receive_some();
+         }
        }},
       {"a program gets a property of 1 MiB",
        [](const std::string& socket, const std::string&) {
