@@ -35,10 +35,20 @@ ClockReading ClockReading::now() noexcept {
   return best;
 }
 
-ClockLine ClockLine::now(PartsPerBillion rate) noexcept {
-  const ClockReading reading = ClockReading::now();
+ClockLine ClockLine::through(const ClockReading& reading, PartsPerBillion rate) noexcept {
   // Later readings may take twice as long.
   return {reading.raw, reading.wall, rate, kMaxOff + std::max(kLeastBlur, 3 * reading.blur)};
+}
+
+ClockLine ClockLine::after(const ClockLine& line, ClockReading& rate_from,
+                           const ClockReading& reading) noexcept {
+  const Duration age = reading.raw - rate_from.raw;
+  if (age < kLeastAge) return through(reading, line.rate);
+  const double gained = static_cast<double>(((reading.wall - rate_from.wall) - age).count());
+  constexpr auto kMax = static_cast<double>(kMaxRate);
+  rate_from = reading;
+  return through(reading, static_cast<PartsPerBillion>(std::clamp(
+                              gained / static_cast<double>(age.count()) * 1e9, -kMax, kMax)));
 }
 
 std::optional<Time> ClockLine::at(RawTime t) const noexcept {
@@ -64,14 +74,17 @@ RawTime ClockLine::arrival(std::optional<Time> arrived, RawTime now) const noexc
   return now - found > kMaxArrivalAge ? now : std::min(found, now);
 }
 
+[[gnu::hot]] bool ClockLine::shows(const ClockReading& reading) const noexcept {
+  const std::optional<Time> expected = at(reading.raw);
+  return expected && std::chrono::abs(reading.wall - *expected) <= tolerance - reading.blur;
+}
+
 [[gnu::hot]] bool ClockLine::holds() const noexcept {
   for (int i = 0; i < kTries; ++i) {
     const ClockReading reading = read_once();
-    if (kMaxOff + reading.blur > tolerance) continue;
-    const std::optional<Time> expected = at(reading.raw);
-    return expected && std::chrono::abs(reading.wall - *expected) <= kMaxOff + reading.blur;
+    if (shows(reading)) return true;
   }
-  return false;  // this PC now takes longer to read its clocks: others have to know
+  return false;  // or this PC now takes longer to read its clocks: others have to know
 }
 
 }  // namespace dssm::clock

@@ -32,13 +32,21 @@ struct ClockLine {
   // Faster or slower than this no program can make the wall clock (adjtimex(2): a tenth).
   static constexpr PartsPerBillion kMaxRate = 200'000'000;
 
+  // From readings that are closer together no rate is taken: what they are uncertain by would count
+  // for all the time until the next line.
+  static constexpr Duration kLeastAge = std::chrono::milliseconds(10);
+
   RawTime raw{};             // where the line begins; zero: there is none
   Time wall{};               // what the wall clock showed there
   PartsPerBillion rate = 0;  // the wall clock gains so much on the RawClock; negative: loses
   Duration tolerance{};      // the wall clock is no further from the line, until there is another
 
-  // A line through this moment.
-  static ClockLine now(PartsPerBillion rate) noexcept;
+  // A line through `reading`.
+  static ClockLine through(const ClockReading& reading, PartsPerBillion rate) noexcept;
+  // The line through `reading` that follows `line`. Its rate is that since `rate_from`, which
+  // becomes `reading`; or that of `line` while that is less than kLeastAge ago.
+  static ClockLine after(const ClockLine& line, ClockReading& rate_from,
+                         const ClockReading& reading) noexcept;
 
   bool exists() const noexcept { return raw != RawTime(); }
   // What the wall clock shows at `t`; nullopt: there is no line, or it is too old.
@@ -50,6 +58,8 @@ struct ClockLine {
   // which is this PC's, allows, and never too early. `now` if the line does not show it, because
   // the clock was set or slewed since then, or there is no stamp.
   RawTime arrival(std::optional<Time> arrived, RawTime now) const noexcept;
+  // Whether the wall clock was on the line, certainly.
+  bool shows(const ClockReading& reading) const noexcept;
   // Whether this PC's wall clock is on the line, which is its own. Three clocks are read.
   bool holds() const noexcept;
 

@@ -324,7 +324,8 @@ void FleetClock::update_setting(const clock::Instant& now) {
     set_at_ = now.mono;
     own.setting_from = watch_.setting_from();
     own.settled_from = {};
-    own.line = clock::ClockLine::now(own.line.rate);
+    rate_from_ = clock::ClockReading::now();
+    own.line = clock::ClockLine::through(rate_from_, own.line.rate);
   } else if (own.settled_from == Time() && now.wall < own.setting_from &&
              now.mono - set_at_ >= kWrittenWithin) {
     own.settled_from = now.wall;
@@ -337,14 +338,9 @@ void FleetClock::update_line(RawTime now) {
   wire::ClockReport& own = *own_;
   clock::ClockLine& line = own.line;
   if (line.holds() && now - line.raw < kLineAge) return;
-  clock::ClockLine next = clock::ClockLine::now(line.rate);
-  if (const Duration age = next.raw - line.raw; line.exists() && age > Duration::zero()) {
-    const double gained = static_cast<double>(((next.wall - line.wall) - age).count());
-    constexpr auto kMax = static_cast<double>(clock::ClockLine::kMaxRate);
-    next.rate = static_cast<clock::PartsPerBillion>(
-        std::clamp(gained / static_cast<double>(age.count()) * 1e9, -kMax, kMax));
-  }
-  line = next;
+  const clock::ClockReading reading = clock::ClockReading::now();
+  if (!line.exists()) rate_from_ = reading;
+  line = clock::ClockLine::after(line, rate_from_, reading);
   watch_.poll_now();
 }
 

@@ -187,6 +187,7 @@ class FleetClock final : public ClockAssessor,
   std::deque<clock::StatedBound> stated_;  // within kReach; all of them bounds
   std::map<std::string, Pair> pairs_;      // by the boot id of the other PC
   RawTime pairs_since_{};                  // the same for all pairs
+  clock::ClockReading rate_from_;          // of the own line
   MonoTime set_at_{};                      // when this clock was set last
   std::uint64_t generation_ = 0;
   std::function<void()> on_change_, on_new_generation_;

@@ -19,8 +19,6 @@ using namespace std::chrono_literals;
 
 Duration ns(double value) { return Duration(std::llround(value)); }
 
-constexpr Duration kTolerance = ClockLine::kMaxOff + 2us;
-
 // An oscillator and the wall clock that is made of it.
 struct Pc {
   double raw_ns = 1e12;
@@ -28,7 +26,10 @@ struct Pc {
   double rate = 0;        // of the oscillator, beyond the true time
   double correction = 0;  // of the wall clock, beyond the oscillator
   ClockLine line;
+  ClockReading rate_from;
   int lines = 0;
+  double blur_ns = 0;  // of its readings, which are wrong by that much at most
+  std::mt19937 random{7};
 
   void pass(double true_ns) {
     const double counted = true_ns * (1 + rate);
@@ -39,20 +40,19 @@ struct Pc {
   Time wall() const { return Time(ns(wall_ns)); }
   void step(double by_ns) {
     wall_ns += by_ns;
-    line = {raw(), wall(), line.rate, kTolerance};
+    rate_from = reading();
+    line = ClockLine::through(rate_from, line.rate);
+  }
+  ClockReading reading() {
+    const double wrong = std::uniform_real_distribution<double>(-blur_ns, blur_ns)(random);
+    return {raw() + ns(wrong), wall(), ns(blur_ns)};
   }
   // As FleetClock does before each batch of samples.
   void keep_line() {
-    const std::optional<Time> expected = line.at(raw());
-    if (expected && std::chrono::abs(wall() - *expected) <= ClockLine::kMaxOff) return;
-    if (expected) {
-      const auto age = static_cast<double>((raw() - line.raw).count());
-      line.rate =
-          std::llround((static_cast<double>((wall() - line.wall).count()) - age) / age * 1e9);
-    }
-    line.raw = raw();
-    line.wall = wall();
-    line.tolerance = kTolerance;
+    if (line.shows(reading())) return;
+    const ClockReading now = reading();
+    if (!line.exists()) rate_from = now;
+    line = ClockLine::after(line, rate_from, now);
     ++lines;
   }
 };
@@ -325,6 +325,22 @@ TEST_F(WallDifferenceTest, IsWithinTheBoundsWhileBothAreSlewedAndSet) {
       pass_and_keep_lines(5e7);
       expect_true_walls();
     }
+  }
+}
+
+// What readings are uncertain by would else be a rate, until the next one.
+TEST_F(WallDifferenceTest, LinesThatFollowEachOtherQuicklyKeepTheRate) {
+  theirs.blur_ns = 5e3;
+  theirs.correction = 0.083;
+  ours.keep_line();
+  for (int i = 0; i < 300; ++i) {
+    beat(1e4);
+    for (int j = 0; j < 3; ++j) pass_and_keep_lines(3e5);
+    pass(3e7);
+    if (i < 3) continue;
+    const WallDifference found = walls();
+    EXPECT_LE(static_cast<double>(to_ns(found.least)), true_walls_ns() + 1e5);
+    EXPECT_GE(static_cast<double>(to_ns(found.greatest)), true_walls_ns() - 1e5);
   }
 }
 

@@ -430,7 +430,7 @@ TEST(DataCommunicator, SaysWhenAPingArrivedAndWhenItWasAnswered) {
   MemoryPeer peer;
   rig.connect(peer);
   rig.ask(peer, with_serial(3, ping_frame()));
-  rig.own_clock->line = clock::ClockLine::now(0);
+  rig.own_clock->line = clock::ClockLine::through(clock::ClockReading::now(), 0);
   rig.own_clock->line.tolerance = 1ms;  // a slow machine, between two instructions
   const RawTime put = RawClock::now();
   peer.arrived = WallClock::now();
