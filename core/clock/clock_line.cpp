@@ -43,7 +43,7 @@ ClockLine ClockLine::through(const ClockReading& reading, PartsPerBillion rate) 
 ClockLine ClockLine::after(const ClockLine& line, ClockReading& rate_from,
                            const ClockReading& reading) noexcept {
   const Duration age = reading.raw - rate_from.raw;
-  if (age < kLeastAge) return through(reading, line.rate);
+  if (age <= kExactness * (rate_from.blur + reading.blur)) return through(reading, line.rate);
   const double gained = static_cast<double>(((reading.wall - rate_from.wall) - age).count());
   constexpr auto kMax = static_cast<double>(kMaxRate);
   rate_from = reading;

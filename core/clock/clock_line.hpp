@@ -32,9 +32,9 @@ struct ClockLine {
   // Faster or slower than this no program can make the wall clock (adjtimex(2): a tenth).
   static constexpr PartsPerBillion kMaxRate = 200'000'000;
 
-  // From readings that are closer together no rate is taken: what they are uncertain by would count
-  // for all the time until the next line.
-  static constexpr Duration kLeastAge = std::chrono::milliseconds(10);
+  // A rate is taken only from readings that are so many times as far apart as they are uncertain:
+  // its error counts for all the time until the next line.
+  static constexpr int kExactness = 1000;
 
   RawTime raw{};             // where the line begins; zero: there is none
   Time wall{};               // what the wall clock showed there
@@ -44,7 +44,7 @@ struct ClockLine {
   // A line through `reading`.
   static ClockLine through(const ClockReading& reading, PartsPerBillion rate) noexcept;
   // The line through `reading` that follows `line`. Its rate is that since `rate_from`, which
-  // becomes `reading`; or that of `line` while that is less than kLeastAge ago.
+  // becomes `reading`; or that of `line`, as long as both are too close together (kExactness).
   static ClockLine after(const ClockLine& line, ClockReading& rate_from,
                          const ClockReading& reading) noexcept;
 

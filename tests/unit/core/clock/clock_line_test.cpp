@@ -53,7 +53,7 @@ TEST(ClockLine, TakesItsRateFromReadingsThatAreFarEnoughApart) {
   ClockReading from{kStart, kWall, 5us};
   ClockLine line = ClockLine::through(from, 100);
   EXPECT_EQ(line.tolerance, ClockLine::kMaxOff + 15us);
-  const ClockReading soon{kStart + ClockLine::kLeastAge / 2, kWall + 6ms, 5us};
+  const ClockReading soon{kStart + 10ms, kWall + 11ms, 5us};  // certain to 10 us
   line = ClockLine::after(line, from, soon);
   EXPECT_EQ(line.raw, soon.raw);
   EXPECT_EQ(line.wall, soon.wall);
@@ -64,6 +64,8 @@ TEST(ClockLine, TakesItsRateFromReadingsThatAreFarEnoughApart) {
   EXPECT_EQ(line.wall, later.wall);
   EXPECT_EQ(line.rate, 50'000'000);
   EXPECT_EQ(from.raw, later.raw);
+  line = ClockLine::after(line, from, {later.raw + 6ms, later.wall + 6ms, 1us});
+  EXPECT_EQ(line.rate, 50'000'000);
   line = ClockLine::after(line, from, {kStart + 1s, kWall + 10s, 5us});
   EXPECT_EQ(line.rate, ClockLine::kMaxRate) << "faster than any clock";
 }
