@@ -157,7 +157,7 @@ class PeerConnection final : private Dialer::Observer {
   std::optional<wire::Greeting> them_;
   RoundTrips round_trips_;
   MonoTime beat_at_{}, their_beat_at_{}, repeated_at_{};
-  bool follows_theirs_ = false;  // the last heartbeat
+  bool follows_theirs_ = false;   // the last heartbeat
   RawTime asked_{}, answered_{};  // the last heartbeat; answered_ 0: not yet
   std::uint64_t carried_bytes_per_s_ = 0;
   bool watching_ = false;

@@ -35,9 +35,9 @@ TEST(ClockLine, HoldsUntilTheClockHasLeftIt) {
   ClockLine line = ClockLine::through(ClockReading::now(), 0);
   line.tolerance = 1s;  // a slow machine, between two instructions
   EXPECT_TRUE(line.holds());
-  line.wall += 1s;
+  line.wall += 2s;
   EXPECT_FALSE(line.holds());
-  line.wall -= 2s;
+  line.wall -= 4s;
   EXPECT_FALSE(line.holds());
 }
 
