@@ -200,7 +200,7 @@ void LocalService::serve(ClientNumber number, const local::Request& request,
   Result<Reply> reply = requests_.serve_untrusted(identity, request, descriptors);
   if (request.has_offer()) log_offer(*identity, request.offer(), reply);
   // A program hears of what it did before the answer.
-  while (tell_news(number)) {
+  while (tell_news(number, end_of_news())) {
   }
   on_answer(number, request.serial(), std::move(reply));
 }
@@ -288,26 +288,28 @@ void LocalService::end_watch(ClientNumber number, Client& client) {
 bool LocalService::go_on(ClientNumber number) {
   const Client& client = clients_.at(number);
   if (client.watch) {
-    if (tell_news(number)) return true;
+    if (tell_news(number, end_of_news())) return true;
     if (!clients_.contains(number)) return false;
     if (client.watch->is_telling) return tell_streams(number);
   }
   return serve_deferred(number);
 }
 
-// Whether there are more. False, too, when the client does not watch, or is disconnected by then.
-bool LocalService::tell_news(ClientNumber number) {
+// Those before `end`. Whether there are more; false, too, when the client does not watch, or is
+// disconnected by then.
+bool LocalService::tell_news(ClientNumber number, std::uint64_t end) {
   std::size_t bytes = 0;
-  for (int sent = 0;; ++sent) {
+  for (int sent = 0;;) {
     const auto found = clients_.find(number);  // sending may end the connection
     if (found == clients_.end() || !found->second.watch) return false;
     Watch& watch = *found->second.watch;
-    if (watch.news == end_of_news()) return false;
+    if (watch.news >= end) return false;
     if (sent == kStreamsPerTurn || bytes >= kStreamBytesPerTurn) return true;
     const News& next = news_[watch.news++ - first_news_];
     if (watch.news == end_of_news()) informed_.insert(number);
-    if (shows(found->second, next.stream) ||
-        (next.is_removed && showed(found->second, next.stream))) {
+    if (!next.frame.empty() && (shows(found->second, next.stream) ||
+                                (next.is_removed && showed(found->second, next.stream)))) {
+      ++sent;
       bytes += next.frame.size();
       found->second.output->send(next.frame, {});
     }
@@ -422,7 +424,12 @@ void LocalService::broadcast(const proto::StreamEvent& event) {
   if (watches_ == 0) return;
   local::Response response;
   *response.mutable_stream_event() = event;
-  news_.push_back({id_of(event), event.removed(), wire::encode_frame(response)});
+  const StreamId id = id_of(event);
+  if (event.property_set()) {
+    clear_property_news(id);
+    properties_[id.str()] = end_of_news();
+  }
+  news_.push_back({id, event.removed(), wire::encode_frame(response)});
   news_bytes_ += sizeof(News) + news_.back().frame.size();
   // The others have more to get already, and their turn comes.
   for (const ClientNumber number : std::exchange(informed_, {})) {
@@ -431,25 +438,40 @@ void LocalService::broadcast(const proto::StreamEvent& event) {
   if (news_bytes_ > kMaxNewsBytes || news_.size() >= 2 * kept_news_ + kStreamsPerTurn) drop_news();
 }
 
-// What all have got, and what takes too much memory: then those that are behind get it into their
-// output, which has limits of its own.
+// A property may be set faster than programs take events: the last one says it all.
+void LocalService::clear_property_news(const StreamId& stream) {
+  const auto newest = properties_.find(stream.str());
+  if (newest == properties_.end()) return;
+  std::string& frame = news_[newest->second - first_news_].frame;
+  news_bytes_ -= frame.size();
+  std::string().swap(frame);
+  properties_.erase(newest);
+}
+
+// What all have got; and the oldest of what takes too much memory, which goes into the output of
+// those that have not got it. That has limits of its own.
 void LocalService::drop_news() {
-  std::uint64_t needed = end_of_news();
-  std::vector<ClientNumber> behind;  // a copy: sending may end connections
+  std::uint64_t end = end_of_news();
   for (const auto& [number, client] : clients_) {
-    if (!client.watch) continue;
-    needed = std::min(needed, client.watch->news);
-    if (news_bytes_ > kMaxNewsBytes) behind.push_back(number);
+    if (client.watch) end = std::min(end, client.watch->news);
   }
-  if (!behind.empty()) {
-    needed = end_of_news();
-    for (const ClientNumber number : behind) {
-      while (tell_news(number)) {
-      }
+  const auto size = [](const News& one) { return sizeof(News) + one.frame.size(); };
+  std::size_t left = news_bytes_;
+  for (std::uint64_t i = first_news_; i < end; ++i) left -= size(news_[i - first_news_]);
+  std::vector<ClientNumber> behind;  // a copy: sending may end connections
+  for (; left > kMaxNewsBytes; ++end) left -= size(news_[end - first_news_]);
+  for (const auto& [number, client] : clients_) {
+    if (client.watch && client.watch->news < end) behind.push_back(number);
+  }
+  for (const ClientNumber number : behind) {
+    while (tell_news(number, end)) {
     }
   }
-  for (; first_news_ < needed; ++first_news_) {
-    news_bytes_ -= sizeof(News) + news_.front().frame.size();
+  for (; first_news_ < end; ++first_news_) {
+    const News& oldest = news_.front();
+    news_bytes_ -= size(oldest);
+    const auto newest = properties_.find(oldest.stream.str());
+    if (newest != properties_.end() && newest->second == first_news_) properties_.erase(newest);
     news_.pop_front();
   }
   kept_news_ = news_.size();

@@ -136,7 +136,7 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   struct News {
     StreamId stream;
     bool is_removed = false;
-    std::string frame;
+    std::string frame;  // empty: its property was set again
   };
   struct Deferred {
     local::Request request;
@@ -171,7 +171,8 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   void send_failure(const Client& client, std::uint64_t serial, const Error& error);
   void broadcast(const proto::StreamEvent& event);
   std::uint64_t end_of_news() const noexcept { return first_news_ + news_.size(); }
-  bool tell_news(ClientNumber number);
+  bool tell_news(ClientNumber number, std::uint64_t end);
+  void clear_property_news(const StreamId& stream);
   void drop_news();
   bool tell_streams(ClientNumber number);
   bool shows(const Client& client, const StreamId& id) const;
@@ -208,6 +209,8 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   std::map<ClientNumber, Client> clients_;
   std::deque<News> news_;  // that some client has not got
   std::uint64_t first_news_ = 0;
+  // That a property was set: the newest, by the stream's name.
+  std::map<std::string, std::uint64_t> properties_;
   std::size_t news_bytes_ = 0, kept_news_ = 0;  // kept_news_: how many were left by drop_news()
   std::size_t watches_ = 0;
   std::set<ClientNumber> informed_;  // that watch and have got all of them

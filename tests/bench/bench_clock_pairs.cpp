@@ -29,13 +29,12 @@ constexpr int kReadings = 100;  // one a second
 constexpr Duration kAllowed = 30us;
 
 // From now on, processes that are started have this boot id.
-void set_boot_id(char digit) {
-  const std::string folder = test::make_temp_dir(), file = folder + "/boot_id";
+void set_boot_id(const std::string& folder, char digit) {
+  const std::string file = folder + "/boot_id" + digit;
   std::ofstream(file) << std::string(8, digit) << "-0000-4000-8000-000000000000\n";
   if (::mount(file.c_str(), "/proc/sys/kernel/random/boot_id", nullptr, MS_BIND, nullptr) != 0) {
     fail("mount a boot id");
   }
-  test::remove_tree(folder);
 }
 
 void print(const char* name, const std::vector<double>& ns) {
@@ -55,11 +54,13 @@ int main() {
   const std::string here = "127.0.0.1:";
   const std::string one_at = here + std::to_string(one_port),
                     other_at = here + std::to_string(other_port);
-  set_boot_id('1');
+  const std::string folder = test::make_temp_dir();
+  set_boot_id(folder, '1');
   test::DaemonProcess one({"--listen", one_at, "--peer", other_at}, "pc1");
-  set_boot_id('2');
+  set_boot_id(folder, '2');
   test::DaemonProcess other({"--listen", other_at, "--peer", one_at}, "pc2");
   ::close(one_fd), ::close(other_fd);
+  test::remove_tree(folder);
   Session session = Session::connect({.socket_path = one.socket_path()}).value();
   std::this_thread::sleep_for(kWarmUp);
   const std::int64_t one_before = sleeps_of(one.pid()), other_before = sleeps_of(other.pid());
