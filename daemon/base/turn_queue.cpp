@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/base/turn_queue.hpp"
 
+#include <algorithm>
 #include <utility>
 
 namespace dssm::daemon {
@@ -16,8 +17,8 @@ bool TurnQueue::Turn::may_begin() {
 
 void TurnQueue::Turn::wait() {
   if (std::exchange(is_waiting_, true)) return;
-  std::list<Turn*>& others = queue_.waiting_[account_];
-  place_ = others.insert(others.end(), this);
+  used_ = std::max(used_, queue_.least_);
+  place_ = queue_.waiting_[account_].emplace(used_, this);
   queue_.next_.enable_in(Duration::zero());
 }
 
@@ -34,11 +35,15 @@ void TurnQueue::run() {
     auto of_account = waiting_.upper_bound(last_);
     if (of_account == waiting_.end()) of_account = waiting_.begin();
     last_ = of_account->first;
-    Turn& turn = *of_account->second.front();
+    Turn& turn = *of_account->second.begin()->second;
     turn.stop();
+    least_ = std::max(least_, turn.used_);
     turn.is_called_ = true;
+    const Duration before = used_;
     turn.take_();
+    turn.used_ += used_ - before;
     turn.is_called_ = false;
+    if (turn.is_waiting_) turn.stop(), turn.wait();  // now by what it has used
   }
   if (!waiting_.empty()) next_.enable_in(Duration::zero());
 }

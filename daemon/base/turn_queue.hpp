@@ -5,7 +5,6 @@
 #pragma once
 
 #include <functional>
-#include <list>
 #include <map>
 #include <string>
 
@@ -15,12 +14,16 @@ namespace dssm::daemon {
 
 // The clients of one server. In each turn of the loop they work for kMaxTurn together, and as long
 // as the last piece of work takes. Who has to wait is called later: one account after another, of
-// each the client that has waited longest.
+// each the client that has worked least in such calls. So a program that asks for little does not
+// wait for hundreds that always have more to do.
 //
 //   threads  one
 class TurnQueue {
  public:
   static constexpr Duration kMaxTurn = std::chrono::milliseconds(1);
+
+  class Turn;
+  using Waiting = std::multimap<Duration, Turn*>;  // of one account, by what they have used
 
   // One client's place.
   class Turn {
@@ -44,7 +47,8 @@ class TurnQueue {
     const std::string account_;
     const std::function<void()> take_;
     bool is_waiting_ = false, is_called_ = false;
-    std::list<Turn*>::iterator place_{};  // while it waits
+    Duration used_{};            // when it was called; see least_
+    Waiting::iterator place_{};  // while it waits
   };
 
   // Measures a piece of work from its construction to its end.
@@ -65,8 +69,10 @@ class TurnQueue {
  private:
   void run();
 
-  // By account; none is empty.
-  std::map<std::string, std::list<Turn*>> waiting_;
+  std::map<std::string, Waiting> waiting_;  // by account; none is empty
+  // The most that one had used when it was called. Who begins to wait counts as if it had used as
+  // much: else a new client, or one that slept, would be served until it has caught up.
+  Duration least_{};
   std::string last_;  // account that was called
   Duration used_{};   // since run(), or of several turns of the loop in which nobody had to wait
   EventSource next_;

@@ -32,7 +32,9 @@ constexpr Duration kAllowed = 30us;
 void set_boot_id(const std::string& folder, char digit) {
   const std::string file = folder + "/boot_id" + digit;
   std::ofstream(file) << std::string(8, digit) << "-0000-4000-8000-000000000000\n";
-  if (::mount(file.c_str(), "/proc/sys/kernel/random/boot_id", nullptr, MS_BIND, nullptr) != 0) {
+  static constexpr const char* kFile = "/proc/sys/kernel/random/boot_id";
+  ::umount(kFile);  // the one before, which else would be what this one is mounted on
+  if (::mount(file.c_str(), kFile, nullptr, MS_BIND, nullptr) != 0) {
     fail("mount a boot id");
   }
 }

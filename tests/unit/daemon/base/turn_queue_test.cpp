@@ -50,8 +50,23 @@ TEST_F(TurnQueueTest, LetsAClientBeginAtOnceUntilTheTimeIsUsedUp) {
 TEST_F(TurnQueueTest, ServesOneAccountAfterAnotherHoweverManyClientsEachHas) {
   Client a1(*this, "a", "1"), a2(*this, "a", "2"), a3(*this, "a", "3"), b(*this, "b", "b");
   for (Client* one : {&a1, &a2, &a3, &b}) one->turn.wait();
-  run_turns(loop, 8);
-  EXPECT_EQ(called, "1b2b3b1b");
+  run_turns(loop, 6);
+  EXPECT_EQ(called, "1b2b3b");
+}
+
+// However many always have more to do.
+TEST_F(TurnQueueTest, ServesFirstWhoHasUsedLeast) {
+  Client a1(*this, "a", "1"), a2(*this, "a", "2"), a3(*this, "a", "3");
+  for (Client* one : {&a1, &a2, &a3}) one->turn.wait();
+  run_turns(loop, 7);
+  Client late(*this, "a", "4");
+  late.turn.wait();
+  called.clear();
+  run_turns(loop, 5);
+  EXPECT_NE(called.substr(0, 2).find('4'), std::string::npos) << called;
+  EXPECT_NE(called.find('1'), std::string::npos) << called;
+  EXPECT_NE(called.find('2'), std::string::npos) << called;
+  EXPECT_NE(called.find('3'), std::string::npos) << called;
 }
 
 TEST_F(TurnQueueTest, ForgetsAClientThatHasStoppedOrIsGone) {
