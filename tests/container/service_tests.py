@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """dssmd.service, dssmd.socket, dssm-record.service and dssm-view.service under a real systemd."""
 
+import json
 import pathlib
 import socket
+import struct
+import subprocess
 import threading
 import time
 from collections.abc import Callable
@@ -75,6 +78,7 @@ class ServiceTests:
             ("clients never find a closed socket during crashes", self.crash),
             ("clients never find a closed socket during restarts", self.restart),
             ("clients never find a closed socket when dssmd hangs", self.hang),
+            ("a reader on another host loses nothing when dssmd is restarted or killed", self.elsewhere),
             ("a stopped dssmd stays stopped, without its socket, although clients connect", self.stop),
             ("a dssmd that is stopped right after a crash stays stopped", self.stop_after_crash),
             ("a mistake in the configuration stops service and socket", self.mistake),
@@ -137,6 +141,32 @@ class ServiceTests:
         assert clients.served and not clients.refused, clients.refused[:3]
         drop_in.unlink()
         self.container.run("systemctl", "daemon-reload")
+
+    def elsewhere(self) -> None:
+        """Test. The other host is a second dssmd here. Prints how long a sample was on its way at most."""
+        run, other = self.container.run, "/run/dssm-other"
+        log = self.container.root / "speed.log"  # of SSM, 2 minutes at 500 Hz
+        log.write_bytes(b"speed 0 8 5000 0.002 1000 0\n" +
+                        b"".join(struct.pack("<dd", 1000 + i * 0.002, i) for i in range(60_000)))
+        run("systemd-run", "--unit=other", "dssmd", "--runtime-dir", other, "--name", "other", "--mdns=false",
+            "--listen", "127.0.0.1:13777", "--peer", "127.0.0.1:13776")
+        run("systemd-run", "--unit=writer", "dssmctl", "play", "/speed.log", "--now")
+        for signal in ("", "", "", "KILL", "KILL", "KILL"):
+            with subprocess.Popen(
+                    ["nsenter", f"--target={self.container.environment['DSSM_CONTAINER']}", "--all", "dssmctl",
+                     "--socket", f"{other}/dssmd.sock", "--json", "delay", "speed", "--wait", "10", "-i", "2.5",
+                     "-n", "1"],
+                    env=self.container.environment, stdout=subprocess.PIPE, text=True) as reader:
+                time.sleep(1)
+                if signal:
+                    self.end_and_await_next(signal)
+                else:
+                    run("systemctl", "restart", "dssmd")
+                found = json.loads(reader.communicate()[0])
+            print(f"  | {'killed' if signal else 'restarted'}: a sample was on its way for up to"
+                  f" {found['delay_max_ns'] / 1e6:.0f} ms", flush=True)
+            assert found["lost_samples"] == 0 and found["seen_samples"] > 500, found
+        run("systemctl", "stop", "writer", "other")
 
     def stop(self) -> None:
         """Test."""
