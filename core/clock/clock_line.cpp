@@ -84,7 +84,7 @@ RawTime ClockLine::arrival(std::optional<Time> arrived, RawTime now) const noexc
     const ClockReading reading = read_once();
     if (shows(reading)) return true;
   }
-  return false;  // or this PC now takes longer to read its clocks: others have to know
+  return false;  // or reading the clocks takes longer now, which others have to know, too
 }
 
 }  // namespace dssm::clock

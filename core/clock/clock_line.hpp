@@ -31,9 +31,9 @@ struct ClockLine {
   static constexpr Duration kMaxAge = std::chrono::hours(1);
   // Faster or slower than this no program can make the wall clock (adjtimex(2): a tenth).
   static constexpr PartsPerBillion kMaxRate = 200'000'000;
-
-  // A rate is taken only from readings that are so many times as far apart as they are uncertain:
-  // its error counts for all the time until the next line.
+  // A rate is computed only from two readings whose distance is so many times the sum of their
+  // `blur`, so that it is wrong by 1000 ppm at most. The error grows with time, until there is
+  // another line.
   static constexpr int kExactness = 1000;
 
   RawTime raw{};             // where the line begins; zero: there is none
@@ -43,8 +43,9 @@ struct ClockLine {
 
   // A line through `reading`.
   static ClockLine through(const ClockReading& reading, PartsPerBillion rate) noexcept;
-  // The line through `reading` that follows `line`. Its rate is that since `rate_from`, which
-  // becomes `reading`; or that of `line`, as long as both are too close together (kExactness).
+  // The line through `reading` that follows `line`. Its rate is what the wall clock gained since
+  // `rate_from`, which becomes `reading`. While these two are too close together (kExactness), the
+  // rate is that of `line`, and `rate_from` stays.
   static ClockLine after(const ClockLine& line, ClockReading& rate_from,
                          const ClockReading& reading) noexcept;
 
@@ -58,9 +59,10 @@ struct ClockLine {
   // which is this PC's, allows, and never too early. `now` if the line does not show it, because
   // the clock was set or slewed since then, or there is no stamp.
   RawTime arrival(std::optional<Time> arrived, RawTime now) const noexcept;
-  // Whether the wall clock was on the line, certainly.
+  // Whether `reading` proves that the wall clock was on the line.
   bool shows(const ClockReading& reading) const noexcept;
-  // Whether this PC's wall clock is on the line, which is its own. Three clocks are read.
+  // Whether this PC's wall clock is on the line, which is its own. Three clocks are read; up to
+  // five times as many if it is not.
   bool holds() const noexcept;
 
   friend bool operator==(const ClockLine& a, const ClockLine& b) = default;

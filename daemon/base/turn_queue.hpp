@@ -13,9 +13,9 @@
 namespace dssm::daemon {
 
 // The clients of one server. In each turn of the loop they work for kMaxTurn together, and as long
-// as the last piece of work takes. Who has to wait is called later: one account after another, of
-// each the client that has worked least in such calls. So a program that asks for little does not
-// wait for hundreds that always have more to do.
+// as the last piece of work takes. Those that have to wait are called later: one account after
+// another, and of each account the client that has used the least time in such calls. So a program
+// that asks for little does not wait for hundreds that always have more to do.
 //
 //   threads  one
 class TurnQueue {
@@ -47,7 +47,7 @@ class TurnQueue {
     const std::string account_;
     const std::function<void()> take_;
     bool is_waiting_ = false, is_called_ = false;
-    Duration used_{};            // when it was called; see least_
+    Duration used_{};            // of the loop's time, when it was called; at least `least_`
     Waiting::iterator place_{};  // while it waits
   };
 
@@ -70,8 +70,9 @@ class TurnQueue {
   void run();
 
   std::map<std::string, Waiting> waiting_;  // by account; none is empty
-  // The most that one had used when it was called. Who begins to wait counts as if it had used as
-  // much: else a new client, or one that slept, would be served until it has caught up.
+  // The greatest `used_` of a client that was called. A client that begins to wait gets at least
+  // this: otherwise a new one, or one that was idle, would be called again and again until it has
+  // used as much as the others.
   Duration least_{};
   std::string last_;  // account that was called
   Duration used_{};   // since run(), or of several turns of the loop in which nobody had to wait

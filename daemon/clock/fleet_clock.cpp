@@ -332,8 +332,8 @@ void FleetClock::update_setting(const clock::Instant& now) {
   }
 }
 
-// The next line has the rate since the one before it began: after two or three of them that is the
-// rate that the clock has now.
+// The next line has the rate since an earlier reading: after two or three lines that is the present
+// rate of the clock.
 void FleetClock::update_line(RawTime now) {
   wire::ClockReport& own = *own_;
   clock::ClockLine& line = own.line;

@@ -42,10 +42,10 @@ class PairMeasurement {
   // virtual machine was moved): then only the newest one counts. False: its times are impossible,
   // or a later one was answered before, and it is ignored.
   bool add_untrusted(const HeartbeatTimes& times) noexcept;
-  // What the other PC's own heartbeats say: this PC's answer to one of them, and the next one.
-  // About a second is between the two, in which a clock may have stood still. So it counts only
-  // beside heartbeats of this PC from before, and when it excludes these, none counts until the
-  // next one.
+  // The same for the other PC's heartbeats: `times` are those of this PC's answer to one of them,
+  // and of the next one. Between the two is about a second, in which a clock may have stood still.
+  // So `times` are ignored unless earlier heartbeats of this PC count; and if they exclude these,
+  // nothing is known until this PC's next heartbeat.
   void add_returned_untrusted(const HeartbeatTimes& times) noexcept;
   void clear() noexcept { heartbeats_.clear(); }
 
@@ -65,7 +65,7 @@ class PairMeasurement {
   struct Heartbeat {
     RawTime answered;
     Bound least, greatest;
-    std::optional<Duration> round_trip;  // none: it was returned, and took long there
+    std::optional<Duration> round_trip;  // none: it is the other PC's heartbeat
   };
   // What two heartbeats say of later moments:
   //   difference <= later.difference + (now - later.at) * rate

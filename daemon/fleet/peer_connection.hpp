@@ -26,7 +26,7 @@ class PeerConnection final : private Dialer::Observer {
   static constexpr std::size_t kMaxWaiting = 4096;
   static constexpr std::size_t kMaxWaitingBytes = 3U << 20;  // two properties of the largest size
 
-  // From a repeated heartbeat to the next one that is repeated.
+  // Between two heartbeats that are repeated.
   static constexpr Duration kRepeat = wire::kHeartbeat * 7 / 2;
 
   // A found host that answers again is back within kFoundRoundTime + ConnectPlan::kMaxPause,
@@ -75,10 +75,10 @@ class PeerConnection final : private Dialer::Observer {
 
   // Sends a heartbeat each second, and closes the connection when the peer is dead: see beat().
   void start_heartbeat();
-  // The peer's own heartbeat came: both PCs are awake, so that this one's is answered sooner now
-  // than at any other time. Sent if half of its second has passed. While the peer sends some, too,
-  // one that was not sent so, and was answered late, is repeated, each fourth at most: so both wake
-  // up about as often as if each sent its own at another time.
+  // A heartbeat of the peer came. Both PCs are awake now, so this host sends its own at once, if
+  // its last one was at least half a second ago: it is answered sooner than at other times.
+  // A heartbeat that was sent at another time, and was answered late, is repeated once; this is
+  // done for one of four at most, so that both PCs do not wake up much more often.
   void on_their_heartbeat();
 
   // Closes the connection and dials again later.

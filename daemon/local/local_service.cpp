@@ -438,7 +438,7 @@ void LocalService::broadcast(const proto::StreamEvent& event) {
   if (news_bytes_ > kMaxNewsBytes || news_.size() >= 2 * kept_news_ + kStreamsPerTurn) drop_news();
 }
 
-// A property may be set faster than programs take events: the last one says it all.
+// A property may be set faster than programs take events: then they get only the last event.
 void LocalService::clear_property_news(const StreamId& stream) {
   const auto newest = properties_.find(stream.str());
   if (newest == properties_.end()) return;
@@ -448,8 +448,8 @@ void LocalService::clear_property_news(const StreamId& stream) {
   properties_.erase(newest);
 }
 
-// What all have got; and the oldest of what takes too much memory, which goes into the output of
-// those that have not got it. That has limits of its own.
+// Drops what all clients have got. If the rest takes too much memory, the oldest of it is sent to
+// those that have not got it, and dropped, too: the output of a client has limits of its own.
 void LocalService::drop_news() {
   std::uint64_t end = end_of_news();
   for (const auto& [number, client] : clients_) {

@@ -136,7 +136,7 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   struct News {
     StreamId stream;
     bool is_removed = false;
-    std::string frame;  // empty: its property was set again
+    std::string frame;  // empty: its property was set again later
   };
   struct Deferred {
     local::Request request;
@@ -209,11 +209,11 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   std::map<ClientNumber, Client> clients_;
   std::deque<News> news_;  // that some client has not got
   std::uint64_t first_news_ = 0;
-  // That a property was set: the newest, by the stream's name.
+  // The number of the newest event that a property was set, by the stream's full name.
   std::map<std::string, std::uint64_t> properties_;
-  std::size_t news_bytes_ = 0, kept_news_ = 0;  // kept_news_: how many were left by drop_news()
+  std::size_t news_bytes_ = 0, kept_news_ = 0;  // kept_news_: how many drop_news() left
   std::size_t watches_ = 0;
-  std::set<ClientNumber> informed_;  // that watch and have got all of them
+  std::set<ClientNumber> informed_;  // clients that watch, and have got all news
 };
 
 }  // namespace dssm::daemon

@@ -101,8 +101,9 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
     virtual void on_ended(DataCommunicator& communicator) = 0;
     // The peer has sent its Hello.
     virtual void on_greeted(DataCommunicator& /*communicator*/) {}
-    // A heartbeat of another program or host arrived, and was answered.
-    //   returned  what that and the one before say of the clocks, if that is known; untrusted
+    // A heartbeat arrived, and was answered.
+    //   returned  when this host's answer to the heartbeat before left and came there, and when
+    //             this heartbeat left there and came; nullopt: not known. Untrusted
     virtual void on_heartbeat(const wire::Greeting& /*them*/,
                               const std::optional<clock::HeartbeatTimes>& /*returned*/) {}
 
@@ -200,7 +201,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   int served_ = 0;                  // in this turn
   Duration served_for_ = {};        // likewise
   bool is_control_ = false;
-  RawTime pong_sent_{};  // the last one to a heartbeat that tells its time
+  RawTime pong_sent_{};  // the last answer to a Ping with raw_ns
   CatalogRequests catalog_;
   std::unique_ptr<StreamWatch> watch_;
   std::optional<Opening> opening_;

@@ -43,8 +43,9 @@ class Rights {
   //            without a name: none
   //   fails    no_permission
   virtual Result<void> check(const Identity& identity, Action action, const StreamId& stream) const;
-  // The same for a request to create a stream, which opens it for writing, by the action `write`,
-  // if it exists. Who may do neither gets the same failure whether it exists or not.
+  // The same for a request to create a stream. If the stream exists, the request opens it for
+  // writing, which is the action `write`. Who may do neither gets the same failure in both cases,
+  // and so does not learn whether the stream exists.
   Result<void> check_create(const Identity& identity, const StreamId& stream, bool exists,
                             Action write) const;
 

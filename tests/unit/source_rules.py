@@ -14,9 +14,9 @@
 #   leaves comments alone, because it breaks tables).
 # * No constant of a source file has the name of one of the public headers: it would hide that from
 #   the sources that are compiled with it at once.
-# * A source includes the header of each function that it calls, itself or by another one; also
-#   where the sources that are compiled with it at once hide that. (Functions of namespaces with a
-#   name of their own; `./check alone` shows the rest.)
+# * A source includes, itself or by another header, the header of each function that it calls.
+#   Compiling many sources at once hides a missing include. This looks only at functions outside of
+#   classes whose names no other header declares; `./check alone` finds all.
 # * A path of the sources in README.md or a document of docs/, and the target of a link, exists.
 import glob
 import os
@@ -91,9 +91,9 @@ SPLIT_RULER = re.compile(r"^\s*//(?! ---? ?\w).*---+$")
 SOURCE_PATH = re.compile(r"(?<![\w./-])(?:core|client|daemon|proto|tests|scripts)/[\w./{,}*-]*[\w}*/]")
 LINK = re.compile(r"\]\((?!\w+:)([^)#\s]+)")
 CODE_BLOCK = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
-# What is no code.
+# Comments and strings.
 IGNORED = re.compile(r'//[^\n]*|"(?:\\.|[^"\\\n])*"|\'(?:\\.|[^\'\\\n])*\'')
-# Functions of a namespace, whose lines are not indented, and of classes.
+# Functions outside of classes, whose lines are not indented, and functions of classes.
 FUNCTION = re.compile(r"^(?!return|using|typedef|friend|else|#|namespace|class|struct|enum)"
                       r"(?:\[\[[\w:]+\]\] )?[\w:<>,&*\s]+?[\s&*](\w+)\(", re.MULTILINE)
 MEMBER = re.compile(r"^ +(?:\[\[\w+\]\] )?[\w:<>,&*\s]+?[\s&*](\w+)\(", re.MULTILINE)

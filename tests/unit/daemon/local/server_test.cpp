@@ -126,6 +126,28 @@ TEST_F(ServerTest, AnswersNothingToAProgramThatHasEnded) {
   EXPECT_EQ(looks, 0);
 }
 
+TEST_F(ServerTest, EndsTheManyOpensOfAProgramAndThenItsPlaceIsFree) {
+  constexpr std::size_t kOpens = 2 * LocalService::kOpensPerTurn + 1;
+  opens.set_limits({kOpens, kOpens});
+  ASSERT_TRUE(registry.create({"a", 0, ""}, odometry_type(), kHistory, 1));
+  local::Request open = open_request("a");
+  UniqueFd program = connect(open);
+  for (std::uint64_t serial = 3; opens.entries().size() < kOpens && serial < 2 * kOpens; ++serial) {
+    EXPECT_GT(read(program, 1 << 16), 0) << "what it does not read would pause it";
+    open.set_serial(serial);
+    const std::string bytes = wire::encode_frame(open);
+    EXPECT_EQ(::send(program.get(), bytes.data(), bytes.size(), 0), std::ssize(bytes));
+    run_turns(loop, 2);
+  }
+  ASSERT_EQ(opens.entries().size(), kOpens);
+  program.reset();
+  run_turns(loop, 20);
+  EXPECT_TRUE(opens.entries().empty());
+  LimitUses uses;
+  server.add_limits(uses);
+  EXPECT_EQ(uses.front().used, 0u) << uses.front().name;
+}
+
 TEST_F(ServerTest, TellsManyStreamsAsFastAsAProgramReads) {
   constexpr int kStreams = 300;
   TypeInfo type = odometry_type();
