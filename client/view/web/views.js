@@ -393,6 +393,8 @@ class Card {
         poseType && !fields ? "its type has no fields of a pose" : (poseSample?.text ?? "no pose");
       note(missing ? `${this.place}: ${reason}; the scan is not placed` : (scan?.note ?? ""));
       const trail = pose ? this.trailUntil(poseSample) : null;
+      const isHeld = this.views.time.t !== null;
+      if (pose && isHeld && this.trail?.toNs !== poseSample.timeNs) this.views.pump.wake();
       this.element.dataset.trailPoints = String(trail?.x.length ?? 0);
       this.drawing.show({ scan, pose, trail });
     } else {
@@ -468,10 +470,12 @@ class Card {
     if (!pose || this.trailS === 0) return false;
     const { time } = this.views;
     const spanNs = BigInt(this.trailS) * 1000000000n;
+    // The poses may have ended long before the held instant.
+    const toNs = time.t === null ? null : (this.samples?.get(stream)?.timeNs ?? time.t);
     const span =
-      time.t === null
+      toNs === null
         ? { span_ns: String(spanNs) }
-        : { from_ns: String(time.t - spanNs), to_ns: String(time.t + 1n) };
+        : { from_ns: String(toNs - spanNs), to_ns: String(toNs + 1n) };
     try {
       const answer = await this.views.connection.request("signals", {
         stream,
@@ -483,13 +487,14 @@ class Card {
       const [x, y] = answer.head.curves ?? [];
       if (!x || !y) return false;
       const from = BigInt(answer.head.from_ns ?? span.from_ns);
-      this.trail = joinTrail(
+      const joined = joinTrail(
         from,
         answer.doubles(x.times_at, x.points),
         answer.doubles(x.values_at, x.points),
         answer.doubles(y.times_at, y.points),
         answer.doubles(y.values_at, y.points),
       );
+      this.trail = { ...joined, toNs };
       if (this.samples) this.show(this.t, this.samples);
     } catch (error) {
       if (!(error instanceof RequestError)) throw error;

@@ -426,6 +426,7 @@ def check_touch(page, stream):
     page.wait("a sample", lambda: page.get(card(stream), "data-tid"))
     page.press(" ")
     settled(page, [stream])
+    page.wait("its trail", lambda: page.get(card(stream), "data-trail-points") == "50")
     canvas = card(stream) + " canvas"
 
     def touch(kind, *points):
@@ -447,7 +448,8 @@ def check_touch(page, stream):
     before, top = page.run(picture, page.one(canvas)), page.run("return scrollY")
     swipe((0, 1))
     page.wait("the page scrolls", lambda: page.run("return scrollY") < top - 40)
-    assert page.run(picture, page.one(canvas)) == before, "the view moves with the page"
+    # The browser scrolls at once, and tells the view afterwards that the finger is not its own.
+    page.wait("the view as before", lambda: page.run(picture, page.one(canvas)) == before)
     swipe((1, 0), (-1, 0))
     page.wait("the view zooms", lambda: page.run(picture, page.one(canvas)) != before)
     assert page.run("return visualViewport.scale") == 1, "the page zooms with the view"
