@@ -47,14 +47,30 @@ void Catalog::host_up(const wire::Greeting& greeting, const wire::Address& addre
 }
 
 void Catalog::host_down(const wire::HostId& id, const Error& error) {
-  const auto removed = hosts_.extract(id);
+  auto removed = hosts_.extract(id);
   if (!removed) return;
-  const KnownHost& host = removed.mapped();
-  for (const auto& entry : host.streams) {
-    notify(
-        [&](CatalogObserver& observer) { observer.on_remote_stream_removed(host, entry.second); });
-  }
+  KnownHost& host = down_.emplace_back(std::move(removed.mapped()));
+  host.is_down = true;
   notify([&](CatalogObserver& observer) { observer.on_host_down(host, error); });
+  tell_some();
+}
+
+bool Catalog::tell_some() {
+  for (int told = 0; !down_.empty(); ++told) {
+    KnownHost& host = down_.front();
+    if (host.streams.empty()) {
+      down_.pop_front();
+      continue;
+    }
+    if (told >= kRemovedPerTurn) return true;
+    const auto removed = host.streams.extract(host.streams.begin());
+    // The host may be up again: then this one was reported as added, or will be.
+    if (has(removed.mapped().id)) continue;
+    notify([&](CatalogObserver& observer) {
+      observer.on_remote_stream_removed(host, removed.mapped());
+    });
+  }
+  return false;
 }
 
 Result<void> Catalog::stream_added(const wire::HostId& id, StreamInfo stream, bool property_set) {

@@ -9,6 +9,7 @@
 #pragma once
 
 #include <cstdint>
+#include <deque>
 #include <dssm/result.hpp>
 #include <dssm/stream.hpp>
 #include <map>
@@ -33,6 +34,7 @@ struct KnownHost {
   wire::Address address;    // where it was reached: channels go there too
   std::map<std::pair<std::string, std::int32_t>, StreamInfo> streams;  // by name and id
   std::size_t stream_bytes = 0;                                        // what `streams` takes
+  bool is_down = false;
 
   std::string str() const;  // "host 'pc2' ('10.0.0.2:13776')"
 };
@@ -41,7 +43,7 @@ struct KnownHost {
 class CatalogObserver {
  public:
   virtual void on_host_up(const KnownHost&) {}
-  virtual void on_host_down(const KnownHost&, const Error&) {}  // after its streams are removed
+  virtual void on_host_down(const KnownHost&, const Error&) {}  // its streams are removed next
   virtual void on_host_clock(const KnownHost&) {}               // it reported its clock
   // Also: it has a new ring, or its ring is described now.
   virtual void on_remote_stream_added(const KnownHost&, const StreamInfo&) {}
@@ -55,6 +57,9 @@ class CatalogObserver {
 
 class Catalog {
  public:
+  // Streams of a host that is down whose removal is reported before others get their turn.
+  static constexpr int kRemovedPerTurn = 256;
+
   explicit Catalog(std::string own_host) : own_host_(std::move(own_host)) {}
   Catalog(const Catalog&) = delete;
   Catalog& operator=(const Catalog&) = delete;
@@ -70,8 +75,12 @@ class Catalog {
   // comes with another instance id has restarted: it is reported as down first, with all its
   // streams.
   void host_up(const wire::Greeting& greeting, const wire::Address& address);
-  // It does not answer any more: its streams leave the catalog.
+  // It does not answer any more: it and its streams are not in the catalog any more, and observers
+  // are told of each: of kRemovedPerTurn streams now, of the others by tell_some().
   void host_down(const wire::HostId& id, const Error& error);
+  // After host_up() and host_down(): tells of some of those that are left.
+  //   returns  whether there are more: to be called again, in another turn of the loop
+  bool tell_some();
   // A stream is there, has a new ring, or is described. Its id names the owner's host. Descriptions
   // of fields are left out when a host has too many of them; what changes with each sample is not
   // kept.
@@ -109,6 +118,7 @@ class Catalog {
 
   std::string own_host_;
   std::map<wire::HostId, KnownHost> hosts_;
+  std::deque<KnownHost> down_;  // with streams whose removal is still to be told
   std::vector<CatalogObserver*> observers_;
 };
 

@@ -160,7 +160,7 @@ class RemoteStreams final : private CatalogObserver {
   // So that a program that was notified of the removal does not get the old ring afterwards. Not
   // when the host itself is down: its stream may still exist.
   void on_remote_stream_removed(const KnownHost& host, const StreamInfo& stream) override {
-    if (!catalog_.find(host.greeting.host_id)) return;
+    if (host.is_down) return;
     for_each_ring_of(host, stream,
                      [&](Kind& entry) { entry.on_stream_removed(stream.incarnation); });
   }

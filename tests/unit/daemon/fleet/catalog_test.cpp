@@ -84,11 +84,34 @@ TEST(Catalog, ReportsAdditionsAndRemovalsInOrder) {
   EXPECT_EQ(recorder.take(), Told{"-imu:0@pc2"});
   catalog.host_down(id_of(2), {Errc::unavailable, "cut"});
   catalog.host_down(id_of(2), {Errc::unavailable, "cut"});
-  EXPECT_EQ(recorder.take(), (Told{"-lidar:0@pc2", "down pc2: cut"}));
+  EXPECT_EQ(recorder.take(), (Told{"down pc2: cut", "-lidar:0@pc2"}));
   EXPECT_TRUE(catalog.hosts().empty());
   catalog.remove_observer(recorder);
   catalog.host_up(host("pc2", 2), at("10.0.0.2"));
   EXPECT_TRUE(recorder.events.empty());
+}
+
+TEST(Catalog, ReportsManyStreamsOfAHostThatIsDownInTurns) {
+  constexpr int kStreams = 2 * Catalog::kRemovedPerTurn + 1;
+  Catalog catalog("pc1");
+  Recorder recorder;
+  catalog.host_up(host("pc2", 2), at("10.0.0.2"));
+  for (int i = 0; i < kStreams; ++i) {
+    ASSERT_TRUE(catalog.stream_added(id_of(2), stream("s" + std::to_string(10'000 + i), "pc2")));
+  }
+  catalog.add_observer(recorder);
+  catalog.host_down(id_of(2), {Errc::unavailable, "cut"});
+  EXPECT_TRUE(catalog.hosts().empty());
+  EXPECT_EQ(recorder.take().size(), 1u + Catalog::kRemovedPerTurn);
+  // It is up again, with one of those that are left.
+  const std::string last = "s" + std::to_string(10'000 + kStreams - 1);
+  catalog.host_up(host("pc2", 2, 2), at("10.0.0.2"));
+  ASSERT_TRUE(catalog.stream_added(id_of(2), stream(last, "pc2", 2)));
+  EXPECT_EQ(recorder.take(), (Told{"up pc2", "+" + last + ":0@pc2"}));
+  EXPECT_TRUE(catalog.tell_some());
+  EXPECT_EQ(recorder.take().size(), std::size_t{Catalog::kRemovedPerTurn});
+  EXPECT_FALSE(catalog.tell_some());
+  EXPECT_EQ(recorder.take(), Told{}) << "it is there";
 }
 
 TEST(Catalog, ReportsANewRingAndNotTheSameOneAgain) {
@@ -134,7 +157,7 @@ TEST(Catalog, TakesAHostWithAnotherLifeForRestarted) {
   ASSERT_TRUE(catalog.stream_added(id_of(2), stream("lidar", "pc2")));
   catalog.add_observer(recorder);
   catalog.host_up(host("pc2", 2, 2), at("192.168.0.2"));
-  EXPECT_EQ(recorder.take(), (Told{"-lidar:0@pc2", "down pc2: its dssmd was restarted", "up pc2"}));
+  EXPECT_EQ(recorder.take(), (Told{"down pc2: its dssmd was restarted", "-lidar:0@pc2", "up pc2"}));
   EXPECT_EQ(catalog.find(id_of(2))->address, at("192.168.0.2"));
   EXPECT_FALSE(catalog.has({"lidar", 0, "pc2"}));
 }

@@ -107,6 +107,22 @@ TEST_F(PeersTest, TakeAHostOutWhenItsConnectionBreaks) {
   EXPECT_EQ(host(0).state(), local::Host::UP);
 }
 
+TEST_F(PeersTest, ReportAllStreamsOfAHostThatIsDown) {
+  struct Observer final : CatalogObserver {
+    void on_remote_stream_removed(const KnownHost&, const StreamInfo&) override { ++removed; }
+    std::size_t removed = 0;
+  } observer;
+  constexpr int kStreams = 6 * Catalog::kRemovedPerTurn;
+  for (int i = 0; i < kStreams; ++i) one.streams.push_back("s" + std::to_string(i));
+  start({&one});
+  wait_for_startup();
+  catalog.add_observer(observer);
+  one.streams = {};
+  one.cut();
+  wait([&] { return observer.removed == kStreams; });
+  catalog.remove_observer(observer);
+}
+
 TEST_F(PeersTest, TakeAHostOutWhenItStopsAnswering) {
   start({&one});
   wait([&] { return one.pings >= 1; });
