@@ -135,8 +135,8 @@ Error failed_read(const RawReader& reader, const std::string& what, ReadStatus s
                    "more depth");
     case ReadStatus::clock_out_of_bounds:
       return error(Errc::clock_out_of_bounds,
-                   "the clocks of its host and of this PC may be too far apart; see `dssmctl "
-                   "clock`");
+                   "the clocks of its host and of this PC may be too far apart, or were when the "
+                   "sample was written; see `dssmctl clock`");
     default:
       return error(Errc::not_found, "nothing was written to it yet");
   }

@@ -59,11 +59,37 @@ std::optional<WallDifference> wall_difference(const PairMeasurement::Difference&
   return found;
 }
 
-PastBounds past_bounds(const std::deque<StatedBound>& stated, Duration latest, Time now,
-                       Duration limit) noexcept {
+void StatedBounds::add(Time now, Duration bound) {
+  constexpr Duration kStep = std::chrono::seconds(1);
+  if (stated_.empty() || now - stated_.back().wall >= kStep) {
+    if (stated_.empty() || now - stated_.back().wall > kMaxGap) unbroken_from_ = now;
+    stated_.push_back({now, bound});
+  }
+  stated_.back().bound = std::max(stated_.back().bound, bound);
+  const Time needed = std::min(unbroken_from_, now - kMinute);
+  while (stated_.front().wall < needed) stated_.pop_front();
+  if (stated_.size() > kMaxSteps) thin();
+}
+
+// Joins each two of the older half, which is more than a minute old.
+void StatedBounds::thin() {
+  std::deque<StatedBound> thinned;
+  const std::size_t half = stated_.size() / 4 * 2;
+  for (std::size_t i = 0; i < half; i += 2) {
+    thinned.push_back({stated_[i].wall, std::max(stated_[i].bound, stated_[i + 1].bound)});
+  }
+  thinned.insert(thinned.end(), stated_.begin() + static_cast<std::ptrdiff_t>(half), stated_.end());
+  stated_ = std::move(thinned);
+}
+
+PastBounds StatedBounds::past(Duration latest, Time now, Duration limit) const noexcept {
   PastBounds past{latest, now, latest, now};
-  for (auto one = stated.rbegin(); one != stated.rend(); ++one) {
-    if (one->bound > std::max(limit, past.greatest)) break;
+  Duration of_minute = latest;
+  for (auto one = stated_.rbegin(); one != stated_.rend(); ++one) {
+    Duration most = std::max(limit, past.greatest);
+    if (one->wall < now - kMinute) most = std::min(most, std::max(2 * of_minute, limit / 10));
+    if (one->bound > most) break;
+    if (one->wall >= now - kMinute) of_minute = std::max(of_minute, one->bound);
     past.greatest = std::max(past.greatest, one->bound);
     past.from = one->wall;
     if (one->wall < now - PastBounds::kRecent) continue;

@@ -50,7 +50,7 @@ std::optional<WallDifference> wall_difference(const PairMeasurement::Difference&
 
 // A bound on a distance that was stated from `wall` on, until the next one.
 struct StatedBound {
-  Time wall;
+  Time wall;  // and of the times until the next one
   Duration bound;
 };
 
@@ -65,8 +65,30 @@ struct PastBounds {
   Time recent_from;
 };
 
-// `stated`: in the order of time. `latest`: the bound at `now`, which may be beyond the limit.
-PastBounds past_bounds(const std::deque<StatedBound>& stated, Duration latest, Time now,
-                       Duration limit) noexcept;
+// What was stated of two clocks, as long as they are compared each second: of the last minute each
+// second, before that in longer steps, the longer ago it is. Times are by this PC's wall clock.
+class StatedBounds {
+ public:
+  static constexpr Duration kMinute = std::chrono::seconds(60);
+  // Clocks that were not compared for longer: what was stated before counts for a minute.
+  static constexpr Duration kMaxGap = std::chrono::seconds(5);
+  static constexpr std::size_t kMaxSteps = 256;
+
+  void add(Time now, Duration bound);
+  void clear() { stated_.clear(); }
+  bool empty() const noexcept { return stated_.empty(); }
+
+  // Of the last minute as far back as all was within the limit. What was stated before that is
+  // included as far back as it is at most twice as great, or a tenth of the limit: the samples of
+  // the last minute are not to count by a busy hour.
+  //   latest  the bound at `now`, which may be beyond the limit
+  PastBounds past(Duration latest, Time now, Duration limit) const noexcept;
+
+ private:
+  void thin();
+
+  std::deque<StatedBound> stated_;
+  Time unbroken_from_{};
+};
 
 }  // namespace dssm::clock

@@ -419,13 +419,7 @@ void FleetClock::state(Pair& pair, const wire::ClockReport& theirs) {
   if (!walls) return;
   pair.last = *walls;
   pair.measured_at = MonoClock::now();
-  const Time now = WallClock::now();
-  constexpr Duration kSpan = std::chrono::seconds(1);
-  if (pair.stated.empty() || now - pair.stated.back().wall >= kSpan) {
-    pair.stated.push_back({now, walls->bound()});
-  }
-  pair.stated.back().bound = std::max(pair.stated.back().bound, walls->bound());
-  while (pair.stated.front().wall < now - kMeasuredReach) pair.stated.pop_front();
+  pair.stated.add(WallClock::now(), walls->bound());
 }
 
 // At this moment.
@@ -457,7 +451,7 @@ std::optional<FleetClock::Measured> FleetClock::measured(const wire::ClockReport
   }
   // As far back as the clocks were close enough: good samples are not to suffer from earlier ones.
   clock::PastBounds& past = measured.past;
-  past = clock::past_bounds(pair.stated, measured.now.bound(), WallClock::now(), limit);
+  past = pair.stated.past(measured.now.bound(), WallClock::now(), limit);
   // Their clock may be ahead of this one, which the times of `stated` are of.
   const Time from = theirs.settled_from == Time() ? theirs.setting_from : theirs.settled_from;
   past.from = std::max(from, past.from + past.greatest);

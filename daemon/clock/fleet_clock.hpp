@@ -54,8 +54,6 @@ class FleetClock final : public ClockAssessor,
   static constexpr Duration kSuccessionDelay = std::chrono::seconds(5);
   // How far back the shared page states bounds.
   static constexpr Duration kReach = std::chrono::seconds(10);
-  // Samples that are older count by their clock error only, and not by what was measured since.
-  static constexpr Duration kMeasuredReach = std::chrono::seconds(60);
   // PCs of which measurements are kept; a further one replaces that which was silent the longest.
   static constexpr std::size_t kMaxPairs = 256;
   // A program writes a sample at most so long after the sample's time, or the time counts as that
@@ -130,12 +128,12 @@ class FleetClock final : public ClockAssessor,
     }
 
     clock::PairMeasurement raws;
-    bool is_confirmed = false;              // by a heartbeat since a clock was set
-    std::int64_t setting = 0;               // of their clock, while this was measured
-    RawTime since{};                        // heartbeats from before do not count
-    std::deque<clock::StatedBound> stated;  // within kMeasuredReach, about one a second
-    clock::WallDifference last;             // the latest
-    MonoTime measured_at{};                 // then
+    bool is_confirmed = false;  // by a heartbeat since a clock was set
+    std::int64_t setting = 0;   // of their clock, while this was measured
+    RawTime since{};            // heartbeats from before do not count
+    clock::StatedBounds stated;
+    clock::WallDifference last;  // the latest
+    MonoTime measured_at{};      // then
   };
   // What follows from a Pair at one moment.
   struct Measured {

@@ -110,13 +110,15 @@ TEST(ClockDistance, AgesAllItsBounds) {
 // What was stated so many seconds before kNow.
 class PastBoundsTest : public testing::Test {
  protected:
-  void state(Duration before, Duration bound) { stated.push_back({kNow - before, bound}); }
-  PastBounds past(Duration latest = 40us) const {
-    return past_bounds(stated, latest, kNow, 1500us);
+  void state(Duration before, Duration bound) { stated.add(kNow - before, bound); }
+  // Once a second from `from` before kNow on, until less than `to` before it.
+  void state_between(Duration from, Duration to, Duration bound) {
+    for (Duration before = from; before > to; before -= 1s) state(before, bound);
   }
+  PastBounds past(Duration latest = 40us) const { return stated.past(latest, kNow, 1500us); }
 
   static constexpr Time kNow{1'795'000'000s};
-  std::deque<StatedBound> stated;
+  StatedBounds stated;
 };
 
 TEST_F(PastBoundsTest, AreOfThisMomentWhenNothingWasStated) {
@@ -146,6 +148,43 @@ TEST_F(PastBoundsTest, EndWhereAClockWasTooFarOff) {
   EXPECT_EQ(past().recent, 50us);
   EXPECT_EQ(past().recent_from, kNow - 1s);
   EXPECT_EQ(past(2ms).from, kNow - 10s) << "it still is";
+}
+
+TEST_F(PastBoundsTest, ReachAsFarBackAsTheClocksWereCompared) {
+  state_between(10h, 0s, 50us);
+  EXPECT_EQ(past().from, kNow - 10h);
+  EXPECT_EQ(past().greatest, 50us);
+}
+
+TEST_F(PastBoundsTest, OfLongAgoIncludeTheGreatestOfTheirTime) {
+  state_between(10h, 5h, 50us);
+  state_between(5h, 5h - 2s, 149us);
+  state_between(5h - 2s, 0s, 50us);
+  EXPECT_EQ(past().from, kNow - 10h);
+  EXPECT_EQ(past().greatest, 149us);
+}
+
+TEST_F(PastBoundsTest, DoNotReachToWhereTheClocksWereComparedLessWell) {
+  state_between(10min, 5min, 800us);
+  state_between(5min, 0s, 50us);
+  EXPECT_EQ(past().greatest, 50us);
+  EXPECT_GE(past().from, kNow - 5min);
+  EXPECT_LE(past().from, kNow - 4min) << "in steps of some seconds";
+  state_between(0s, -1s, 400us);
+  EXPECT_EQ(past(400us).from, kNow - 10min);
+}
+
+TEST_F(PastBoundsTest, DoNotReachOverATimeWithoutHeartbeats) {
+  state_between(10min, 5min, 50us);
+  state_between(5min - 20s, 0s, 50us);
+  EXPECT_EQ(past().from, kNow - (5min - 20s));
+}
+
+TEST_F(PastBoundsTest, OfTheLastMinuteReachOverATimeWithoutHeartbeats) {
+  state_between(5min, 40s, 50us);
+  state_between(20s, 0s, 50us);
+  EXPECT_GE(past().from, kNow - 61s);
+  EXPECT_LE(past().from, kNow - 59s);
 }
 
 }  // namespace
