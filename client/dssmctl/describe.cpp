@@ -29,8 +29,12 @@ std::string note(const HostInfo& host) {
 
 }  // namespace
 
-Json mirror_json(const MirrorInfo& mirror) {
-  return {{"state", name_of(mirror.state)},
+Json mirror_json(const StreamInfo& stream) {
+  const MirrorInfo& mirror = *stream.mirror;
+  const Duration behind = behind_owner(stream);
+  const bool is_behind = mirror.state == MirrorState::live && behind > Duration();
+  return {{"state", is_behind ? "behind" : name_of(mirror.state)},
+          {"behind_ns", to_ns(behind)},
           {"newest_tid", mirror.newest != kNoTid ? Json(mirror.newest) : Json()},
           {"newest_time_ns", mirror.newest != kNoTid ? Json(to_ns(mirror.newest_time)) : Json()},
           {"received_samples", mirror.received_samples},
@@ -217,7 +221,7 @@ void add_details(Json& json, const StreamInfo& stream) {
                      {"program", or_null(user.program)},
                      {"via", name_of(user.via)}});
   }
-  json["mirror"] = stream.mirror ? mirror_json(*stream.mirror) : Json();
+  json["mirror"] = stream.mirror ? mirror_json(stream) : Json();
 }
 
 // Both times are of the owner's clock. A sample may be on its way, and the two were looked at one
@@ -236,6 +240,7 @@ Duration behind_owner(const StreamInfo& stream) {
 
 std::string carried_text(const StreamInfo& stream) {
   if (!stream.mirror || stream.mirror->recent_lost_samples == 0) return {};
+  if (stream.mirror->state != MirrorState::live || stream.rate_hz <= 0) return {};  // as it was
   const double share = 1 - static_cast<double>(stream.mirror->recent_lost_samples) /
                                static_cast<double>(stream.mirror->recent_samples);
   const double carried_hz = share * stream.rate_hz;

@@ -51,7 +51,8 @@ void print_fields(const TypeInfo& type, Output& out);
 Json fields_json(const TypeInfo& type);
 
 // How this PC's mirror of a stream is doing.
-Json mirror_json(const MirrorInfo& mirror);
+// `stream` has a mirror here. Its state is "behind" when it is live and not fresh.
+Json mirror_json(const StreamInfo& stream);
 
 // What `info` adds: fields, users, and how the mirror is doing.
 void add_details(Json& json, const StreamInfo& stream);

@@ -259,8 +259,8 @@ Finding check_chronyd(const Facts& facts) {
       break;
   }
   return {"clock", Status::warn, "chrony is not installed",
-          "nothing bounds the difference between this clock and the others; with clock_policy = "
-          "\"enforce\", the default, their streams are not opened",
+          "nothing keeps this clock and the others together; when they are too far apart, reads "
+          "by time of the others' streams are refused",
           "sudo apt install chrony"};
 }
 
@@ -276,7 +276,8 @@ Advice clock_advice(const Facts& facts, const ClockSnapshot& clock, bool serves,
     case ClockReason::no_chronyd:
     case ClockReason::silent:
       return {where + "chronyd is not running, hangs, or its cmdport is closed",
-              restart_chrony(facts)};
+              restart_chrony(facts) +
+                  (where.empty() ? "" : "  # or install it: sudo apt install chrony")};
     case ClockReason::unsynchronized:
       if (serves) {
         return {where +
@@ -640,11 +641,33 @@ void check_hosts(const Facts& facts, Findings& findings) {
   }
 }
 
+bool has_clock_to_check(const HostInfo& host) {
+  if (host.state != HostState::up || (!host.clock && host.clock_reason.empty())) return false;
+  return is_other_pc(host) || !host.clock_reason.empty();
+}
+
+// Of a clock and this PC's, which are too far apart although each of them seems good: which of the
+// two disagrees with the others.
+std::string odd_clock_text(const Facts& facts) {
+  std::vector<std::string> agree, disagree;
+  for (const HostInfo& host : facts.hosts) {
+    if (!has_clock_to_check(host)) continue;
+    (host.clock_reason.empty() ? agree : disagree).push_back(name_of(host));
+  }
+  if (!agree.empty() && disagree.size() == 1) {
+    return fmt::format("the clock of {} is the odd one out: this PC's agrees with {}", disagree[0],
+                       list_text(agree));
+  }
+  if (agree.empty() && disagree.size() > 1) {
+    return fmt::format("the clocks of all others ({}) disagree with this PC's", list_text(disagree));
+  }
+  return "the two follow different clocks, or the network delays packets";
+}
+
 // Whether reads by time of the other PCs' samples succeed here, by what readers themselves use.
 void check_fleet_clocks(const Facts& facts, Findings& findings) {
   for (const HostInfo& host : facts.hosts) {
-    if (host.state != HostState::up || (!host.clock && host.clock_reason.empty())) continue;
-    if (!is_other_pc(host) && host.clock_reason.empty()) continue;
+    if (!has_clock_to_check(host)) continue;
     Finding finding{"clock of " + name_of(host), Status::ok,
                     fmt::format("at most {} from this one's", bound_text(host.clock_distance))};
     if (!host.clock_reason.empty()) {
@@ -652,7 +675,7 @@ void check_fleet_clocks(const Facts& facts, Findings& findings) {
           fmt::format("reads of its samples by time are {}: {}",
                       host.clock_refused ? "refused" : "marked as bad", host.clock_reason);
       const std::optional<ClockSnapshot>& own = facts.hosts.front().clock;
-      Advice advice{"the two follow different clocks, or the network delays packets",
+      Advice advice{odd_clock_text(facts),
                     "chronyc sources  # here and there: both have to follow one reference"};
       if (host.clock && !is_good(*host.clock)) {
         advice = clock_advice(facts, *host.clock, !followers(facts, host).empty(),

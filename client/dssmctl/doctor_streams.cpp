@@ -103,7 +103,7 @@ Finding check_mirrors(const Facts& facts) {
   if (behind.empty()) {
     return {"mirrors", Status::ok,
             mirrors == 0
-                ? "no stream of another host is read here"
+                ? "no stream of another host that answers is read here"
                 : fmt::format("the network carries all that programs here read of {}",
                               mirrors == 1 ? "a stream of another host"
                                            : fmt::format("{} streams of other hosts", mirrors))};

@@ -56,7 +56,7 @@ Json streams_json(const std::vector<StreamInfo>& streams, std::optional<TimeRang
     Json json = ctl::stream_json(stream);
     json["oldest_ns"] = oldest ? time_json(*oldest) : Json();
     json["newest_ns"] = oldest ? time_json(stream.newest_time) : Json();
-    json["mirror"] = stream.mirror ? ctl::mirror_json(*stream.mirror) : Json();
+    json["mirror"] = stream.mirror ? ctl::mirror_json(stream) : Json();
     list.push_back(std::move(json));
     // Samples of a black box may be hours older than all others.
     if (!oldest || ctl::is_of_black_box(stream.id)) continue;

@@ -242,16 +242,22 @@ Result<void> Mirror::follow_untrusted(const StreamInfo& theirs) {
   const std::string context = "mirror '" + name_ + "'";
   const std::uint64_t depth = depth_for(theirs);
   is_shorter_ = depth < theirs.depth;
-  std::shared_ptr<Stream> stream = DSSM_TRY(Stream::create({.id = id_,
-                                                            .type = theirs.type,
-                                                            .depth = depth,
-                                                            .cycle = theirs.cycle,
-                                                            .account = account(),
-                                                            .purpose = Purpose::mirror,
-                                                            .incarnation = theirs.incarnation},
-                                                           parts_.registry.budgets()),
-                                            context);
-  return DSSM_TRY(use_offered(std::move(stream)), context), Result<void>();
+  Result<std::shared_ptr<Stream>> stream = Stream::create({.id = id_,
+                                                           .type = theirs.type,
+                                                           .depth = depth,
+                                                           .cycle = theirs.cycle,
+                                                           .account = account(),
+                                                           .purpose = Purpose::mirror,
+                                                           .incarnation = theirs.incarnation},
+                                                          parts_.registry.budgets());
+  if (!stream && stream.error().code == Errc::limit_exceeded) {
+    return Error{Errc::limit_exceeded,
+                 stream.error().message +
+                     "; or keep less of another host's stream here (key mirror_streams)"}
+        .context(context);
+  }
+  if (!stream) return std::move(stream).error().context(context);
+  return DSSM_TRY(use_offered(*std::move(stream)), context), Result<void>();
 }
 
 // The owner's stream may be described while this host mirrors it. Lists leave out the fields of

@@ -151,6 +151,7 @@ class ServiceTests:
         run("systemd-run", "--unit=other", "dssmd", "--runtime-dir", other, "--name", "other", "--mdns=false",
             "--listen", "127.0.0.1:13777", "--peer", "127.0.0.1:13776")
         run("systemd-run", "--unit=writer", "dssmctl", "play", "/speed.log", "--now")
+        delays_ms = []
         for signal in ("", "", "", "KILL", "KILL", "KILL"):
             with subprocess.Popen(
                     ["nsenter", f"--target={self.container.environment['DSSM_CONTAINER']}", "--all", "dssmctl",
@@ -163,10 +164,13 @@ class ServiceTests:
                 else:
                     run("systemctl", "restart", "dssmd")
                 found = json.loads(reader.communicate()[0])
+            delays_ms.append(found["delay_max_ns"] / 1e6)
             print(f"  | {'killed' if signal else 'restarted'}: a sample was on its way for up to"
-                  f" {found['delay_max_ns'] / 1e6:.0f} ms", flush=True)
+                  f" {delays_ms[-1]:.0f} ms", flush=True)
             assert found["lost_samples"] == 0 and found["seen_samples"] > 500, found
         run("systemctl", "stop", "writer", "other")
+        # Some 60 ms on an idle PC. Of a busy one, the best tells a new design from a busy moment.
+        assert min(delays_ms) < 500, delays_ms
 
     def stop(self) -> None:
         """Test."""

@@ -52,6 +52,37 @@ TEST(StreamJson, HasNullForWhatIsNotKnown) {
   EXPECT_EQ(stream_json(stream)["writers"], 0);
 }
 
+TEST(StreamJson, SaysThatAMirrorIsBehind) {
+  StreamInfo stream;
+  stream.newest = 100;
+  stream.newest_time = time_from_ns(10'000'000'000);
+  stream.cycle = std::chrono::milliseconds(10);
+  stream.rate_hz = 100;
+  MirrorInfo& mirror = stream.mirror.emplace();
+  mirror.state = MirrorState::live;
+  mirror.newest = 99;
+  mirror.newest_time = time_from_ns(9'990'000'000);
+  EXPECT_EQ(mirror_json(stream)["state"], "live");
+  EXPECT_EQ(mirror_json(stream)["behind_ns"], 0);
+  mirror.newest_time = time_from_ns(8'500'000'000);
+  EXPECT_EQ(mirror_json(stream)["state"], "behind");
+  EXPECT_EQ(mirror_json(stream)["behind_ns"], 1'500'000'000);
+  mirror.state = MirrorState::owner_unavailable;
+  EXPECT_EQ(mirror_json(stream)["state"], "owner unavailable");
+}
+
+TEST(CarriedText, SaysNothingWhileTheOwnerIsDown) {
+  StreamInfo stream;
+  stream.rate_hz = 30;
+  MirrorInfo& mirror = stream.mirror.emplace();
+  mirror.state = MirrorState::live;
+  mirror.recent_samples = 90;
+  mirror.recent_lost_samples = 57;
+  EXPECT_EQ(carried_text(stream), "carries 11 of 30 samples a second");
+  mirror.state = MirrorState::owner_unavailable;
+  EXPECT_EQ(carried_text(stream), "");
+}
+
 TEST(HostJson, PrintsTheSameAsJson) {
   const Json json = host_json(closed_host());
   EXPECT_EQ(json["host"], "pc2");

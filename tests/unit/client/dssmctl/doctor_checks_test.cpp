@@ -439,11 +439,24 @@ TEST(Doctor, FailsWhereReadersRefuse) {
             "PC's clock");
   facts.hosts[1].clock =
       clock_of(ClockStatus::out_of_bounds, ClockReason::no_chronyd, ClockBasis::nothing);
-  EXPECT_FINDING(facts, "clock of pc2", Status::fail, "sudo systemctl restart chrony  # on pc2");
+  EXPECT_FINDING(facts, "clock of pc2", Status::fail, "apt install chrony; on pc2");
   facts.hosts[1].clock_refused = false;  // clock_policy = "mark"
-  EXPECT_FINDING(facts, "clock of pc2", Status::warn, "# on pc2");
+  EXPECT_FINDING(facts, "clock of pc2", Status::warn, "; on pc2");
   facts.hosts[1].clock.reset();  // it reports none
   EXPECT_FINDING(facts, "clock of pc2", Status::warn, "chronyc sources");
+}
+
+TEST(Doctor, NamesTheClockThatDisagreesWithTheOthers) {
+  Facts facts = with_clocks();
+  refuse(facts, "one of them follows a clock that was set or is wrong");
+  EXPECT_TRUE(finding_of(facts, "clock of pc2").cause.starts_with("the two follow different"));
+  facts.hosts.push_back(facts.hosts[1]);
+  facts.hosts[2].name = "pc3";
+  EXPECT_EQ(finding_of(facts, "clock of pc2").cause,
+            "the clocks of all others (pc2, pc3) disagree with this PC's");
+  facts.hosts[2].clock_reason.clear();
+  EXPECT_EQ(finding_of(facts, "clock of pc2").cause,
+            "the clock of pc2 is the odd one out: this PC's agrees with pc3");
 }
 
 TEST(Doctor, FindsHostsOfOneName) {

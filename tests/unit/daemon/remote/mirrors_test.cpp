@@ -254,6 +254,7 @@ TEST_F(MirrorsTest, RefusesWhatDoesNotFitIntoItsMemory) {
   run_until(loop, [&] { return answer->has_value(); });
   EXPECT_EQ((*answer)->error().code, Errc::limit_exceeded);
   EXPECT_NE((*answer)->error().message.find("max_memory"), std::string::npos);
+  EXPECT_NE((*answer)->error().message.find("key mirror_streams"), std::string::npos);
 }
 
 TEST_F(MirrorsTest, CountsTowardsTheStreamsOfThisHost) {
