@@ -14,6 +14,7 @@
 #include <charconv>
 #include <cmath>
 #include <cstdio>
+#include <limits>
 #include <optional>
 
 namespace vehicle {
@@ -24,6 +25,8 @@ namespace {
 // problem: on each side of a pause the stamp is near the median.
 constexpr double kBelievableS = 5;
 constexpr std::size_t kAround = 5;
+
+constexpr double kNoReflectionM = 81.91;  // what a SICK LMS reports then: 13 bits of 1 cm
 
 // Reads the blank-separated words of one line.
 class Words {
@@ -86,7 +89,9 @@ std::optional<ScanReading> parse_scan(Words& words) {
   for (std::size_t i = 0; i < static_cast<std::size_t>(*count); ++i) {
     const std::optional<double> range = words.number();
     if (!range || *range < 0) return std::nullopt;
-    scan.ranges_m.push_back(static_cast<float>(*range));
+    const bool is_reflected = *range < kNoReflectionM;
+    scan.ranges_m.push_back(is_reflected ? static_cast<float>(*range)
+                                         : std::numeric_limits<float>::infinity());
   }
   const auto v = words.numbers<7>();
   if (!v) return std::nullopt;

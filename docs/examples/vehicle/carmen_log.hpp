@@ -24,7 +24,8 @@ struct OdometryReading {
 
 struct ScanReading {
   double time_s = 0;            // since the start of the log
-  std::vector<float> ranges_m;  // over the front half circle, from right to left
+  std::vector<float> ranges_m;  // over the front half circle, from right to left; infinite
+                                // without a reflection (ROS, REP 117)
   Pose2 laser;                  // the laser's pose according to the log's scan matcher
 };
 

@@ -14,7 +14,7 @@ namespace {
 
 constexpr double kMinRangeM = 0.2;  // nearer: the robot, or the laser's window
 constexpr double kMaxWallM = 10;    // a degree of error in the pose is 17 cm there
-constexpr double kMaxRangeM = 40;   // the LIDAR reports 81.91 without a reflection
+constexpr double kMaxRangeM = 40;   // farther reflections are few, and infinite is none
 constexpr int kWallEvidence = 3;
 constexpr int kFreeEvidence = -1;
 constexpr std::int16_t kMaxEvidence = 60;  // so that a door that opens can still become free

@@ -24,7 +24,7 @@ struct Scan {
   std::int32_t beams;  // how many of range_m are used
   float first_rad;     // direction of range_m[0] from straight ahead, counter-clockwise
   float step_rad;      // from each beam to the next
-  float range_m[kMaxBeams];
+  float range_m[kMaxBeams];  // infinite without a reflection
 
   bool is_end() const { return beams == 0; }
 

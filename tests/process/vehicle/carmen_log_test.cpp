@@ -7,6 +7,7 @@
 #include <zlib.h>
 
 #include <algorithm>
+#include <cmath>
 #include <cstdlib>
 #include <fstream>
 #include <string>
@@ -45,7 +46,7 @@ TEST(CarmenLog, ReadsEveryFieldThatTheVehicleUses) {
   EXPECT_EQ(log.odometry[0].pose.theta_rad, 0.25);
   ASSERT_EQ(log.scans.size(), 1u);
   EXPECT_EQ(log.scans[0].time_s, 12.75);
-  EXPECT_EQ(log.scans[0].ranges_m, (std::vector<float>{1, 2.5, 81.91F}));
+  EXPECT_EQ(log.scans[0].ranges_m, (std::vector<float>{1, 2.5, INFINITY}));
   EXPECT_EQ(log.scans[0].laser.x_m, 4);
   EXPECT_EQ(log.scans[0].laser.y_m, 5);
   EXPECT_EQ(log.scans[0].laser.theta_rad, 6);

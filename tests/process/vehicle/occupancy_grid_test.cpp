@@ -49,7 +49,7 @@ TEST(OccupancyGrid, TurnsBeamsWithTheLaser) {
 
 TEST(OccupancyGrid, IgnoresBeamsWithoutReflection) {
   OccupancyGrid grid;
-  add_beam(grid, {0.025, 0.025, 0}, 81.91F);
+  add_beam(grid, {0.025, 0.025, 0}, INFINITY);
   add_beam(grid, {0.025, 0.025, 0}, 0.05F);
   add_beam(grid, {0.025, 0.025, 0}, std::nanf(""));
   EXPECT_LT(grid.known().last_column, grid.known().first_column);
