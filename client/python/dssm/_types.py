@@ -6,6 +6,7 @@ fields, and arrays whose elements are neither adjacent nor parts of structs.
 """
 
 import dataclasses
+import numbers
 import re
 import typing
 from typing import Any
@@ -284,18 +285,21 @@ def _scalar_kind(dtype: np.dtype, path: str) -> tuple[str, int]:
 
 
 def pack(value: Any, dtype: np.dtype, is_described: bool) -> np.ndarray:
-    """A new array, adjacent in memory, with the bytes of `value`."""
+    """A new array, adjacent in memory, with the bytes of `value`.
+
+    Raises ValueError for a number that the dtype cannot hold, and for a text that is too long: numpy
+    would write other ones in their place.
+    """
     base, shape = dtype.subdtype or (dtype, ())
     if not is_described and base == np.uint8:
         return _pack_bytes(value, dtype)
     array = np.zeros(shape, base)
     if isinstance(value, np.ndarray) and value.shape == () and value.dtype.names is not None:
         value = value[()]
-    if base.names is None or shape:
-        given = np.asarray(value)
-        if given.shape != shape:
-            raise ValueError(f"the stream's samples have the shape {shape}, not {given.shape}")
-        array[...] = given
+    if base.names is None:
+        array[...] = _fitting(value, base, shape, "")
+    elif shape:
+        _assign_array(array, value, shape, "the sample")
     else:
         _assign(array[()], value, "")
     return array
@@ -331,10 +335,7 @@ def _assign(record: Any, value: Any, path: str) -> None:
         base, shape = member.subdtype or (member, ())
         inner = f"{path}.{name}" if path else name
         if base.names is None:
-            given = np.asarray(value[name])
-            if given.shape != shape:
-                raise ValueError(f"{inner} has the shape {shape}, not {given.shape}")
-            record[name] = given
+            record[name] = _fitting(value[name], base, shape, inner)
         elif not shape:
             _assign(record[name], value[name], inner)
         else:
@@ -353,3 +354,122 @@ def _assign_array(target: np.ndarray, value: Any, shape: tuple[int, ...], path: 
             _assign_array(target[i], value[i], shape[1:], f"{path}[{i}]")
         else:
             _assign(target[i], value[i], f"{path}[{i}]")
+
+
+# --- what fits
+
+
+_RANGES = {dtype: (int(np.iinfo(dtype).min), int(np.iinfo(dtype).max)) for dtype in _BY_DTYPE if dtype.kind in "iu"}
+
+
+def _fitting(value: Any, base: np.dtype, shape: tuple[int, ...], path: str) -> Any:
+    """`value`, which can be assigned to an array of that dtype and shape without a change."""
+    if not shape:  # the most frequent ones need no array
+        if type(value) is float and base == np.float64:
+            return value
+        if type(value) is int and base.kind in "iu":
+            low, high = _RANGES[base]
+            if low <= value <= high:
+                return value
+            raise _does_not_fit(value, base, path)
+    try:
+        given = np.asarray(value)
+        if base.kind in "iu" and given.dtype.kind == "f" and not isinstance(value, np.ndarray | np.generic | float):
+            given = np.asarray(value, object)  # a float cannot hold each integer of a list
+    except ValueError as error:
+        raise ValueError(f"{_named(path)}: {error}") from error
+    if given.shape != shape:
+        raise ValueError(f"{_named(path)} has the shape {shape}, not {given.shape}")
+    if given.dtype == base or np.can_cast(given.dtype, base, "safe") and given.dtype.kind in "biuf":
+        return given
+    if base.kind in "SV":
+        return _fitting_bytes(given, base, path)
+    if given.dtype.kind == "O":
+        return _fitting_objects(given, base, path)
+    if given.dtype.kind not in "biuf":
+        raise TypeError(f"{_named(path)} is {base}, and {_first(given)!r} is not a number")
+    with np.errstate(all="ignore"):  # the comparisons below find what does not fit
+        if base.kind == "b":
+            fits = (given == 0) | (given == 1)
+        elif base.kind == "f":
+            result = given.astype(base)
+            fits = ~np.isinf(result) | np.isinf(given)
+            given = result if fits.all() else given
+        elif given.dtype.kind == "f":
+            low, high = _RANGES[base]
+            wide = given.astype(np.float64)
+            # float(high + 1) is exact, float(high) of 64 bits is not.
+            fits = (wide == np.floor(wide)) & (wide >= float(low)) & (wide < float(high + 1))
+        else:
+            low, high = _RANGES[base]
+            # numpy compares integers of two kinds as floats; Python does not.
+            if low <= int(given.min()) and int(given.max()) <= high:
+                return given
+            fits = np.reshape([low <= int(each) <= high for each in given.flat], shape)
+    if not fits.all():
+        raise _first_that_does_not_fit(given, ~fits, base, path)
+    return given
+
+
+def _fitting_objects(given: np.ndarray, base: np.dtype, path: str) -> np.ndarray:
+    """The same for numbers that numpy has no type for, such as large integers and decimal.Decimal."""
+    result = np.zeros(given.shape, base)
+    for index in np.ndindex(given.shape):
+        value = given[index]
+        inner = path + "".join(f"[{i}]" for i in index)
+        if not isinstance(value, numbers.Number):
+            raise TypeError(f"{_named(inner)} is {base}, and {value!r} is not a number")
+        if base.kind in "iu":
+            low, high = _RANGES[base]
+            # Comparisons with NaN and infinity are false, so that int() gets neither.
+            if not low <= value <= high or int(value) != value:  # type: ignore[operator, call-overload]
+                raise _does_not_fit(value, base, inner)
+            result[index] = int(value)  # type: ignore[call-overload]
+        else:
+            try:
+                result[index] = _fitting(float(value), base, (), inner)  # type: ignore[arg-type]
+            except OverflowError:
+                raise _does_not_fit(value, base, inner) from None
+    return result
+
+
+def _fitting_bytes(given: np.ndarray, base: np.dtype, path: str) -> np.ndarray:
+    """The same for texts and bytes of a fixed length; a str has ASCII characters only."""
+    if given.dtype.kind == "V" and given.dtype.names is None:
+        given = given.view(f"S{given.itemsize}")
+    if given.dtype.kind not in "SU":
+        raise TypeError(f"{_named(path)} has {base.itemsize} bytes, and {_first(given)!r} is neither bytes nor a text")
+    lengths = np.char.str_len(given)  # without zeros at the end, which fill a field anyway
+    if (lengths > base.itemsize).any():
+        raise _first_that_does_not_fit(given, lengths > base.itemsize, base, path)
+    try:
+        return given.astype(f"S{base.itemsize}").astype(base)
+    except UnicodeEncodeError as error:
+        raise ValueError(f"{_named(path)}: a text is of ASCII characters; encode others to bytes: {error}") from error
+
+
+def _named(path: str) -> str:
+    return path if path and not path.startswith("[") else "the sample" + path
+
+
+def _first(given: np.ndarray) -> Any:
+    return given.flat[0]
+
+
+def _first_that_does_not_fit(given: np.ndarray, wrong: np.ndarray, base: np.dtype, path: str) -> ValueError:
+    index = tuple(int(i) for i in np.argwhere(wrong)[0])
+    return _does_not_fit(given[index].item(), base, path + "".join(f"[{i}]" for i in index))
+
+
+def _does_not_fit(value: Any, base: np.dtype, path: str) -> ValueError:
+    if base.kind in "SV":
+        return ValueError(f"{_named(path)}: {value!r} has {len(value)} bytes, and there is space for {base.itemsize}")
+    if base.kind in "iu":
+        low, high = _RANGES[base]
+        holds = f"which holds whole numbers from {low} to {high}"
+    elif base.kind == "b":
+        holds = "which holds True and False"
+    else:
+        high = np.finfo(base).max
+        holds = f"which holds numbers from {-high} to {high}"
+    return ValueError(f"{_named(path)}: {value} does not fit into {base}, {holds}")

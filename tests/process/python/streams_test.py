@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+from decimal import Decimal
 from typing import Annotated
 
 import dssm
@@ -170,6 +171,51 @@ class Types(Case):
         with self.assertRaises(TypeError):
             writer.write(3)
         self.assertEqual(writer.newest_tid, dssm.NO_TID)
+
+    def test_values_that_do_not_fit_are_refused(self):
+        """numpy would write other ones: 70000 becomes 4464 in an int16, and 1.5 becomes 1."""
+        numbers = np.dtype([("n", "i2"), ("u", "u8"), ("f", "f4"), ("b", "?"), ("s", "S3"), ("v", "V2"),
+                            ("a", "u1", 3), ("p", [("x", "i4")], 2)])
+        writer, reader = self.create("fitting", numbers)
+        good = {"n": -32768, "u": 2**64 - 1, "f": 1e38, "b": True, "s": "abc", "v": b"ab", "a": [0, 1, 255], "p": [(1,), (2,)]}
+        writer.write(good, T0)
+        value = reader.newest().value
+        self.assertEqual((value.n, value.u, value.b, value.s, list(value.a)), (-32768, 2**64 - 1, True, b"abc", [0, 1, 255]))
+        writer.write(good | {"n": 3.0, "u": Decimal(7), "f": float("inf"), "b": 0, "s": b"a", "a": np.array([1.0, 2.0, 3.0])}, T0)
+        value = reader.newest().value
+        self.assertEqual((value.n, value.u, value.f, value.b, value.s, list(value.a)), (3, 7, np.inf, False, b"a", [1, 2, 3]))
+        whole = "n: .* does not fit into int16, which holds whole numbers from -32768 to 32767"
+        for field, bad, text in (
+                ("n", 70000, "^n: 70000 does not fit into int16, which holds whole numbers from -32768 to 32767$"),
+                ("n", np.int64(70000), whole), ("n", 1.5, whole), ("n", float("nan"), whole), ("n", float("inf"), whole),
+                ("n", 10**30, whole), ("n", Decimal("1.5"), whole),
+                ("u", -1, "^u: -1 does not fit into uint64"), ("u", np.int8(-1), "^u: -1 "), ("u", 2.0**64, "^u: "),
+                ("f", 1e39, "^f: 1e\\+39 does not fit into float32"), ("b", 2, "^b: 2 does not fit into bool"),
+                ("s", b"abcd", "^s: b'abcd' has 4 bytes, and there is space for 3$"), ("s", "é", "^s: .*ASCII"),
+                ("v", b"abc", "^v: b'abc' has 3 bytes, and there is space for 2$"),
+                ("a", [1, 2, 256], "^a\\[2\\]: 256 does not fit into uint8"), ("a", np.array([1, -2, 3]), "^a\\[1\\]: -2 "),
+                ("a", [1, 2], "^a has the shape \\(3,\\), not \\(2,\\)"), ("a", [[1], [2, 3], 4], "^a: .*inhomogeneous"),
+                ("p", [(1,), (2**31,)], "^p\\[1\\].x: 2147483648 does not fit into int32"), ("p", [(1,)], "^p has 2 elements")):
+            with self.subTest(field=field, bad=bad), self.assertRaisesRegex(ValueError, text):
+                writer.write(good | {field: bad})
+        for field, bad in (("n", "3"), ("n", None), ("f", "1"), ("f", 1j), ("s", 3), ("u", np.datetime64(3, "ns")), ("a", [1, None, 2])):
+            with self.subTest(field=field, bad=bad), self.assertRaisesRegex(TypeError, f"^{field}"):
+                writer.write(good | {field: bad})
+        wider = np.zeros((), [("n", "i8")])
+        wider["n"] = 70000
+        narrow, _ = self.create("narrow", np.dtype([("n", "i2")]))
+        scalar, _ = self.create("scalars", "u1")
+        array, of_array = self.create("arrays", ("u8", (2,)))
+        for bad in (wider, wider[()], (70000,)):
+            with self.subTest(bad=bad), self.assertRaisesRegex(ValueError, "^n: 70000"):
+                narrow.write(bad)
+        with self.assertRaisesRegex(ValueError, "^the sample: 256 does not fit into uint8"):
+            scalar.write(256)
+        with self.assertRaisesRegex(ValueError, "^the sample\\[1\\]: -1 "):
+            array.write([1, -1])
+        array.write([1, 2**63 + 1], T0)  # of which numpy makes floats
+        self.assertEqual(list(of_array.newest().value), [1, 2**63 + 1])
+        self.assertEqual([w.newest_tid for w in (writer, narrow, scalar, array)], [1, dssm.NO_TID, dssm.NO_TID, 0])
 
     def test_scalars_and_arrays(self):
         writer, reader = self.create("scalar", np.float32)
