@@ -105,14 +105,15 @@ Borrowed borrow(const std::shared_ptr<Reader>& reader, std::optional<Tid> tid) {
 
 // The samples from the first one from which on all have time >= t0 up to the first one with
 // time >= t1, copied once.
-py::object history(Reader& reader, py::handle from, py::handle to) {
+py::object history(Reader& reader, py::handle from, py::handle to, py::handle wait) {
   const Time t0 = to_time(from), t1 = to_time(to);
+  const MonoTime arriving_until = wait_deadline(wait);
   Reads<RawReader>& reads = reader.reads;
-  RawReader& raw = reads.raw();
   const py::object scratch = reads.values().new_array();
   const auto text = [&](Time t) { return "the history, " + Reads<RawReader>::text_of(t); };
   while (t0 < t1) {
     reads.check_leases();
+    RawReader& raw = reads.raw();  // another thread may have closed it during a pause
     SampleInfo first, last;
     ReadStatus status = raw.read_at_or_after(t0, ValueType::bytes_of(scratch), first);
     if (status == ReadStatus::restarted) {
@@ -120,19 +121,22 @@ py::object history(Reader& reader, py::handle from, py::handle to) {
       continue;
     }
     if (status == ReadStatus::not_yet) break;
+    if (status == ReadStatus::arriving && reads.pause_while_arriving(arriving_until)) continue;
     if (status != ReadStatus::ok) raise(status, raw.id(), text(t0));
     status = raw.find(t1 - Duration(1), last);
     if (status == ReadStatus::not_yet || status == ReadStatus::too_old) break;
+    if (status == ReadStatus::arriving && reads.pause_while_arriving(arriving_until)) continue;
     if (status != ReadStatus::ok) raise(status, raw.id(), text(t1));
     if (last.tid < first.tid) break;
 
     Rows rows(reads.values(), static_cast<std::size_t>(last.tid - first.tid + 1));
+    Tid tid = first.tid;
     {
       const Use use(reads.in_use());
       status = without_gil([&] {
         const Tid cursor = raw.cursor();
         ReadStatus read = ReadStatus::ok;
-        for (Tid tid = first.tid; tid <= last.tid; ++tid) {
+        for (; tid <= last.tid; ++tid) {
           SampleInfo info;
           read = raw.read_tid(tid, rows.payload(), info);
           if (read == ReadStatus::restarted || read == ReadStatus::arriving) break;
@@ -144,7 +148,13 @@ py::object history(Reader& reader, py::handle from, py::handle to) {
         return read;
       });
     }
-    if (status == ReadStatus::arriving) raise(status, raw.id(), text(t1));
+    if (status == ReadStatus::arriving) {
+      const Use use(reads.in_use());
+      const bool is_here = wait_in_slices(
+          arriving_until, [&](MonoTime end) { return raw.wait_for_sample(tid, end); });
+      if (!is_here) raise(status, raw.id(), text(t1));
+      continue;
+    }
     if (status != ReadStatus::restarted) return rows.result();
     reads.is_new() = false;
   }
@@ -206,7 +216,8 @@ void raise(ReadStatus status, const StreamId& id, const std::string& what) {
           "clock_limit allows; `dssmctl hosts` shows them";
       break;
     case ReadStatus::arriving:
-      reason = "it is on its way from the stream's host: read it again a little later";
+      reason =
+          "it is on its way from the stream's host: read it again a little later, or with wait=";
       break;
     case ReadStatus::lost:
       reason = "it is lost: the network could not carry it, or it was not recorded";
@@ -242,13 +253,16 @@ void define_readers(py::module_& module) {
       "Reads a stream. It has a cursor for next() and previous(); reads by time leave it.\n\n"
       "For one thread at a time. Session.reader() makes it.");
   define_reads(type);
-  type.def("history", &history, py::arg("t0"), py::arg("t1"),
+  type.def("history", &history, py::arg("t0"), py::arg("t1"), py::kw_only(),
+           py::arg("wait") = false,
            "The samples with t0 <= time < t1 that the ring still has, as one numpy.recarray with "
            "the "
            "fields tid, time_ns, clock_error_ns and value. Keeps the cursor.\n\n"
            "If times run backwards: from the first sample from which on all are at least t0, up to "
            "the "
-           "first one that is at least t1.")
+           "first one that is at least t1.\n\n"
+           "wait: for samples that are on their way from another host, True waits without a limit, "
+           "a duration at most so long; then Arriving is raised.")
       .def("borrow", &borrow, py::arg("tid") = py::none(),
            "Sample `tid`, or the newest one, without a copy: `with reader.borrow() as sample:`.\n\n"
            "The end of the block raises Overwritten if a writer has overwritten it. Raises NotYet, "
@@ -268,6 +282,18 @@ void define_readers(py::module_& module) {
           },
           py::arg("tid"), py::arg("timeout") = py::none(),
           "Waits until newest_tid is at least `tid`; whether it is.")
+      .def(
+          "wait_for_sample",
+          [](Reader& r, Tid tid, py::handle timeout) {
+            RawReader& raw = r.reads.raw();
+            const MonoTime deadline = to_deadline(timeout);
+            const Use use(r.reads.in_use());
+            return wait_in_slices(deadline,
+                                  [&](MonoTime end) { return raw.wait_for_sample(tid, end); });
+          },
+          py::arg("tid"), py::arg("timeout") = py::none(),
+          "Waits until sample `tid` is here or never will be, so that tid() does not raise "
+          "Arriving; whether it is so.")
       .def("fileno", &fileno,
            "A descriptor for select and asyncio: readable when there may be samples newer than at "
            "the "
@@ -296,8 +322,8 @@ void define_readers(py::module_& module) {
   module.def("wait_any", &wait_any, py::arg("readers"), py::arg("timeout") = py::none(),
              "Waits until one of the readers has a sample after its cursor; whether one has.");
   module.def("_read_joint", [](py::handle time, const std::vector<std::shared_ptr<Reader>>& readers,
-                               py::handle max_error, py::handle max_age) {
-    return read_joint<JointSample>(time, readers, max_error, max_age);
+                               py::handle max_error, py::handle max_age, py::handle wait) {
+    return read_joint<JointSample>(time, readers, max_error, max_age, wait);
   });
 }
 

@@ -16,6 +16,7 @@
 #include <memory>
 #include <optional>
 #include <set>
+#include <thread>
 #include <vector>
 
 #include "client/python/python.hpp"
@@ -97,11 +98,12 @@ class Reads {
 
   // --- by time
 
-  py::object at(py::handle time, py::handle max_age) {
+  py::object at(py::handle time, py::handle max_age, py::handle wait) {
     const Time t = to_time(time);
     const Duration age = to_duration(max_age, kAnyAge);
     return read_by_time(
-        [&](Raw& raw, auto payload, auto& info) { return raw.read_at(t, payload, info, age); }, t);
+        [&](Raw& raw, auto payload, auto& info) { return raw.read_at(t, payload, info, age); }, t,
+        wait_deadline(wait));
   }
   py::object at_or_after(py::handle time) {
     const Time t = to_time(time);
@@ -157,8 +159,10 @@ class Reads {
   }
 
   // A read that may set the cursor or continue with another ring; `what` names it for errors.
+  // Repeated until the deadline while the sample is `arriving`.
   template <class Read, class What>
-  py::object read(Read read, What what, bool follows_restarts = true) {
+  py::object read(Read read, What what, bool follows_restarts = true,
+                  MonoTime arriving_until = MonoTime::min()) {
     check_leases();
     const py::object array = values_.new_array();
     SampleInfo info;
@@ -169,7 +173,8 @@ class Reads {
         is_new_ = false;
         check_leases();
       }
-    } while (status == ReadStatus::restarted && follows_restarts);
+    } while ((status == ReadStatus::restarted && follows_restarts) ||
+             (status == ReadStatus::arriving && pause_while_arriving(arriving_until)));
     if (status == ReadStatus::not_yet) return py::none();
     if (status != ReadStatus::ok) raise(status, raw_->id(), what());
     is_new_ = false;
@@ -182,6 +187,20 @@ class Reads {
     return wait_in_slices(deadline, [&](MonoTime end) { return raw.wait(end); });
   }
 
+  // After a read whose sample is `arriving`: sleeps until it is worth another attempt. Nothing
+  // notifies of a time whose sample has arrived, so the reads are repeated.
+  //   returns  whether the deadline has not passed
+  bool pause_while_arriving(MonoTime deadline) {
+    constexpr Duration kPeriod = std::chrono::milliseconds(5);
+    if (MonoClock::now() >= deadline) return false;
+    {
+      const Use use(in_use_);
+      without_gil([&] { std::this_thread::sleep_until(std::min(deadline, deadline_in(kPeriod))); });
+    }
+    if (PyErr_CheckSignals() != 0) throw py::error_already_set();
+    return true;
+  }
+
   // For reads that set the cursor where Python's must keep it.
   bool& is_new() { return is_new_; }
 
@@ -189,10 +208,11 @@ class Reads {
 
  private:
   template <class Read>
-  py::object read_by_time(Read by_time, Time t) {
+  py::object read_by_time(Read by_time, Time t, MonoTime arriving_until = MonoTime::min()) {
     const bool was_new = is_new_;  // reads by time keep the cursor
     const std::uint64_t restarts = raw().restarts();
-    py::object sample = read(by_time, [&] { return text_of(t); });
+    py::object sample = read(
+        by_time, [&] { return text_of(t); }, true, arriving_until);
     is_new_ = was_new && raw_->restarts() == restarts;
     return sample;
   }
@@ -336,8 +356,9 @@ class FastReads {
   static PyObject* at(PyObject* self, PyObject* const* given, Py_ssize_t count,
                       PyObject* keywords) {
     return guarded([&] {
-      const auto [time, age] = arguments<2>("at", {"time", "max_age"}, 1, given, count, keywords);
-      return reader_of(self).reads.at(time, age ? age : Py_None);
+      const auto [time, age, wait] =
+          arguments<3>("at", {"time", "max_age", "wait"}, 1, given, count, keywords);
+      return reader_of(self).reads.at(time, age ? age : Py_None, wait ? wait : Py_False);
     });
   }
   static PyObject* next(PyObject* self, PyObject* const* given, Py_ssize_t count,
@@ -361,12 +382,14 @@ class FastReads {
        "TooOld, Lost, "
        "Arriving, Restarted."},
       {"at", function(&at), METH_FASTCALL | METH_KEYWORDS,
-       "at($self, time, max_age=None)\n--\n\n"
+       "at($self, time, max_age=None, wait=False)\n--\n\n"
        "The newest sample that is not later than `time`, and at that time not older than "
        "`max_age`.\n\n"
        "None while nothing is written. Raises TooOld (all are later), Stale, ClockOutOfBounds, "
        "Arriving. "
-       "Keeps the cursor."},
+       "Keeps the cursor.\n\n"
+       "wait: for a sample that is on its way from another host, True waits without a limit, a "
+       "duration at most so long; then Arriving is raised."},
       {"next", function(&next), METH_FASTCALL | METH_KEYWORDS,
        "next($self, wait=False)\n--\n\n"
        "The sample after the cursor; None if there is none yet. A new reader of a live stream "

@@ -32,7 +32,9 @@ struct RecordedReader {
 };
 
 // As of a live stream, of all incarnations; read by a reader of its own, which keeps the cursor.
-py::object recorded_history(RecordedReader& reader, py::handle from, py::handle to) {
+// `wait` is that of Reader.history(): nothing arrives in a recording.
+py::object recorded_history(RecordedReader& reader, py::handle from, py::handle to,
+                            py::handle /*wait*/) {
   const Time t0 = to_time(from), t1 = to_time(to);
   const ValueType& values = reader.reads.values();
   RecordedRawReader raw = RecordedReader::open(reader.recording, reader.reads.raw().id());
@@ -262,7 +264,8 @@ void define_reading(py::module_& module) {
       "None is the end. For one thread at a time. Recording.reader() makes it.");
   define_reads(reader);
   reader
-      .def("history", &recorded_history, py::arg("t0"), py::arg("t1"),
+      .def("history", &recorded_history, py::arg("t0"), py::arg("t1"), py::kw_only(),
+           py::arg("wait") = false,
            "The samples with t0 <= time < t1 as one numpy.recarray, as Reader.history().")
       .def("__iter__", [](py::object self) { return self; })
       .def("__next__", [](RecordedReader& r) {
@@ -324,8 +327,8 @@ void define_reading(py::module_& module) {
            "it had none.");
   module.def("_read_joint_recorded",
              [](py::handle time, const std::vector<std::shared_ptr<RecordedReader>>& readers,
-                py::handle max_error, py::handle max_age) {
-               return read_joint<RecordedJointSample>(time, readers, max_error, max_age);
+                py::handle max_error, py::handle max_age, py::handle wait) {
+               return read_joint<RecordedJointSample>(time, readers, max_error, max_age, wait);
              });
 }
 

@@ -326,10 +326,12 @@ void define_sessions(py::module_& module) {
            "or a TypeInfo, and raises TypeMismatch if the stream has another one.\n"
            "wait: False raises NotFound at once; True waits for the stream, a duration at most so "
            "long.\n"
-           "fetch_history: of another host's stream, have its history here when this returns.")
-      .def("create", &create_stream, py::arg("name"), py::arg("type"), py::kw_only(),
-           py::arg("cycle"), py::arg("life") = py::none(), py::arg("depth") = py::none(),
-           py::arg("keep_existing") = false,
+           "fetch_history: of another host's stream, fetch its history, and return when it is here "
+           "or after 1 s. Else it is fetched when it is read, which raises Arriving until it is "
+           "here.")
+      .def("create", &create_stream, py::arg("name"), py::arg("type") = py::none(), py::kw_only(),
+           py::arg("cycle") = py::none(), py::arg("life") = py::none(),
+           py::arg("depth") = py::none(), py::arg("keep_existing") = false,
            "Creates a stream, if there is none of that type, and opens it for writing.\n\n"
            "type: as in reader().\n"
            "cycle: the expected time between two samples.\n"

@@ -52,17 +52,20 @@ class JointSamples(tuple[Sample, ...]):
 
 
 def read_joint(time: Any, readers: Sequence[Reader] | Sequence[RecordedReader], *, max_error: Any = None,
-               max_age: Any = None) -> JointSamples | None:
+               max_age: Any = None, wait: Any = False) -> JointSamples | None:
     """The sample of each stream that at(time) returns: of all of them or none.
 
     All readers are of live streams, or all of recordings. None while one of the streams has no sample.
     Raises as at(); also ClockOutOfBounds when the time of a sample may be further than `max_error` from
     this PC's clock. Cursors are kept.
+
+    wait: for samples that are on their way from another host, True waits without a limit, a duration at
+    most so long; then Arriving is raised.
     """
     readers = list(readers)
     recorded = bool(readers) and isinstance(readers[0], RecordedReader)
     read = _dssm._read_joint_recorded if recorded else _dssm._read_joint
-    result = read(time, readers, max_error, max_age)
+    result = read(time, readers, max_error, max_age, wait)
     if result is None:
         return None
     samples = JointSamples(result[0])

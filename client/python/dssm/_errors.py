@@ -118,7 +118,7 @@ class ClockOutOfBounds(ReadError):
 
 
 class Arriving(ReadError):
-    """The sample is on its way from another host."""
+    """The sample is on its way from another host: read it again later, or with wait=."""
 
     code = "arriving"
 

@@ -4,6 +4,7 @@
     python3 plot_stream.py STREAM                  opens a window
     python3 plot_stream.py STREAM --out FILE.png   draws the next --seconds into a file
 
+STREAM may be another host's, as odometry@pc1.
 Needs matplotlib: apt-get install python3-matplotlib.
 """
 
@@ -42,15 +43,16 @@ def main() -> int:
         matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    reader = dssm.Session().reader(options.stream, wait=True)
+    reader = dssm.Session().reader(options.stream, wait=True, fetch_history=True)
     span_ns = int(options.seconds * 1e9)
     figure, axes = pyplot.subplots()
 
-    def draw() -> None:
+    def draw(patience: float) -> None:
+        """Draws the past; waits so long for what is on its way from another host."""
         latest = reader.newest()
         if latest is None:
             return
-        history = reader.history(latest.time_ns - span_ns, latest.time_ns + 1)
+        history = reader.history(latest.time_ns - span_ns, latest.time_ns + 1, wait=patience)
         age = (history.time_ns - latest.time_ns) / 1e9
         axes.clear()
         for name, column in numbers(history["value"]).items():
@@ -61,7 +63,10 @@ def main() -> int:
     if options.out:
         reader.wait()
         time.sleep(options.seconds)
-        draw()
+        try:
+            draw(patience=10)
+        except dssm.Arriving as error:
+            sys.exit(f"plot_stream.py: {error}")
         figure.savefig(options.out)
         return 0
     pyplot.ion()
@@ -69,7 +74,10 @@ def main() -> int:
     while pyplot.fignum_exists(figure.number):  # until the window is closed
         if reader.wait(0.1):
             reader.seek(reader.newest_tid)
-            draw()
+            try:
+                draw(patience=0.1)
+            except dssm.Arriving:
+                pass  # the next samples come with another attempt
         figure.canvas.flush_events()
         time.sleep(0.03)  # as often as a person sees
     return 0

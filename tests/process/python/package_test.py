@@ -9,11 +9,13 @@ import re
 import subprocess
 import sys
 import tempfile
+import time
 import unittest
 
 import dssm
+import numpy as np
 from dssm import _dssm
-from support import BUILD, PATIENT_S, SOURCE, Case, await_that
+from support import BUILD, PATIENT_S, SOURCE, Case, Daemon, await_that
 
 IGNORED = {"__doc__", "__module__", "__new__", "__init__", "__repr__", "__str__", "__hash__", "__weakref__", "__dict__"}
 
@@ -125,7 +127,45 @@ class Document(Case):
                 writer.wait()
 
 
+# In place of matplotlib, which need not be installed: writes how many points are drawn.
+MATPLOTLIB = {"__init__.py": "def use(name): pass", "pyplot.py": """
+class Axes:
+    def __init__(self): self.points = {}
+    def plot(self, x, y, label): self.points[label] = len(x)
+    def clear(self): self.points = {}
+    def set(self, **texts): pass
+    def legend(self, loc): pass
+class Figure:
+    def __init__(self, axes): self.axes = axes
+    def savefig(self, file): open(file, "w").write(str(self.axes.points))
+def subplots():
+    axes = Axes()
+    return Figure(axes), axes
+"""}
+
+
 class Example(Case):
+    def test_plot_of_another_host(self):
+        """The past, which is on its way when the example begins to draw."""
+        pc2 = Daemon("pc2", [self.daemon])
+        self.addCleanup(pc2.close)
+        with self.session.create("far", np.dtype([("x", "f8"), ("rest", "u1", 65536)]), depth=512, cycle=0.01) as writer, \
+                tempfile.TemporaryDirectory() as folder:
+            (pathlib.Path(folder) / "matplotlib").mkdir()
+            for name, text in MATPLOTLIB.items():
+                (pathlib.Path(folder) / "matplotlib" / name).write_text(text)
+            sample = np.zeros((), writer.dtype)
+            now = time.time_ns()
+            for i in range(300):
+                writer.write(sample, now + i * 1_000_000)
+            drawn = pathlib.Path(folder) / "drawn"
+            plot = subprocess.run(
+                [sys.executable, SOURCE / "docs/examples/python/plot_stream.py", "far@pc1", "--seconds", "0.29", "--out", drawn],
+                stderr=subprocess.PIPE, text=True, timeout=2 * PATIENT_S,
+                env=os.environ | {"DSSM_SOCKET": pc2.socket_path, "PYTHONPATH": f"{folder}:{os.environ['PYTHONPATH']}"})
+            self.assertEqual((plot.returncode, plot.stderr), (0, ""))
+            self.assertEqual(drawn.read_text(), "{'x': 291}")
+
     def test_plot(self):
         """The example plots a stream into a file; without matplotlib it says what to install."""
         with self.session.create("wave", "f8", depth=1024, cycle=0.01) as writer, tempfile.TemporaryDirectory() as folder:

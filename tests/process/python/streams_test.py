@@ -18,7 +18,7 @@ from typing import Annotated
 
 import dssm
 import numpy as np
-from support import BUILD, PATIENT_S, Case, await_that, python
+from support import BUILD, PATIENT_S, Case, Daemon, await_that, python
 
 
 @dataclasses.dataclass
@@ -683,6 +683,91 @@ class Reads(Case):
         self.assertEqual(len(poll.poll(PATIENT_S * 1000)), 1)
         self.reader.clear_ready()
         self.assertEqual(self.reader.next().value.v, 1)
+
+
+class OtherHosts(Case):
+    """Streams of pc1, read on pc2."""
+
+    @classmethod
+    def setUpClass(cls):
+        super().setUpClass()
+        cls.pc2 = Daemon("pc2", [cls.daemon])
+        cls.addClassCleanup(cls.pc2.close)
+
+    def setUp(self):
+        super().setUp()
+        self.there = dssm.Session(self.pc2.socket_path, request_timeout=PATIENT_S)
+        self.addCleanup(self.there.close)
+
+    def create(self, name, samples):
+        """A stream of pc1 with that many samples of 64 KiB, a second apart."""
+        writer = self.session.create(name, ("u1", (65536,)), depth=1024, cycle=1)
+        self.addCleanup(writer.close)
+        payload = np.zeros(65536, "u1")
+        for i in range(samples):
+            payload[0] = i
+            writer.write(payload, T0 + i * SECOND)
+        return writer
+
+    def reader(self, name, **options):
+        reader = self.there.reader(name + "@pc1", wait=PATIENT_S, **options)
+        self.addCleanup(reader.close)
+        return reader
+
+    def test_the_past_of_another_host_arrives_when_it_is_read(self):
+        for name, wait in (("past", PATIENT_S), ("past2", True)):
+            with self.subTest(wait=wait):
+                self.create(name, 200)
+                reader = self.reader(name)
+                self.assertEqual(list(reader.history(T0, T0 + 200 * SECOND, wait=wait).tid), list(range(200)))
+                self.assertEqual(reader.at(T0 + 3 * SECOND).tid, 3)  # it is here now
+                self.assertEqual(reader.cursor, dssm.NO_TID)
+
+    def test_reads_raise_arriving_until_it_is_here(self):
+        for name, call in (("tid", lambda r: r.tid(0)), ("at", lambda r: r.at(T0)), ("nearest", lambda r: r.nearest(T0)),
+                           ("find", lambda r: r.find(T0)), ("history", lambda r: r.history(T0, T0 + SECOND)),
+                           ("joint", lambda r: dssm.read_joint(T0, [r]))):
+            with self.subTest(name=name):
+                self.create("early_" + name, 100)
+                reader = self.reader("early_" + name)
+                await_that(lambda: reader.newest())
+                with self.assertRaises(dssm.Arriving) as caught:
+                    call(reader)
+                self.assertIn("on its way", str(caught.exception))
+
+    def test_single_reads_wait(self):
+        for name, call in (("at", lambda r: r.at(T0, wait=PATIENT_S)), ("at2", lambda r: r.at(T0, None, True)),
+                           ("joint", lambda r: dssm.read_joint(T0, [r], wait=PATIENT_S)[0]),
+                           ("tid", lambda r: r.tid(0) if r.wait_for_sample(0, PATIENT_S) else None)):
+            with self.subTest(name=name):
+                self.create("waited_" + name, 100)
+                self.assertEqual(call(self.reader("waited_" + name)).tid, 0)
+
+    def test_waits_for_history_end(self):
+        """The history does not arrive while pc1 does not answer."""
+        self.create("stopped", 100)
+        reader = self.reader("stopped")
+        await_that(lambda: reader.newest())
+        self.daemon.stop()
+        try:
+            for call in (lambda: reader.at(T0, wait=0.05), lambda: reader.history(T0, T0 + SECOND, wait=0.05),
+                         lambda: dssm.read_joint(T0, [reader], wait=0.05)):
+                started = time.monotonic()
+                with self.assertRaises(dssm.Arriving):
+                    call()
+                self.assertGreaterEqual(time.monotonic() - started, 0.05)
+            self.assertFalse(reader.wait_for_sample(0, 0.01))
+        finally:
+            self.daemon.resume()
+        self.assertEqual(reader.at(T0, wait=PATIENT_S).tid, 0)
+
+    def test_fetch_history(self):
+        """It is here when the reader is."""
+        self.create("fetched", 10)
+        reader = self.reader("fetched", fetch_history=True)
+        self.assertEqual(len(reader.history(T0, T0 + 10 * SECOND)), 10)
+        self.assertEqual(reader.at(T0).value[0], 0)
+        self.assertEqual(dssm.read_joint(T0 + SECOND, [reader])[0].tid, 1)
 
 
 INTERRUPTED = """

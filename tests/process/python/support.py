@@ -3,14 +3,16 @@
 
 import os
 import pathlib
+import re
 import shutil
+import signal
 import socket
 import subprocess
 import sys
 import tempfile
 import time
 import unittest
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 # Meson sets the folders; the package is not installed there, but complete.
 BUILD = pathlib.Path(os.environ["DSSM_BUILD_ROOT"])
@@ -19,10 +21,11 @@ PATIENT_S = 60.0  # for what happens at once on a machine that is not busy
 
 
 class Daemon:
-    """A dssmd with a folder of its own, which does not use the network."""
+    """A dssmd with a folder of its own, on loopback only; of other hosts it connects to `peers`."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str = "pc1", peers: Sequence["Daemon"] = ()) -> None:
         self._folder = tempfile.mkdtemp(prefix="dssm-test-")
+        self._flags = ["--name", name] + [word for peer in peers for word in ("--peer", peer.address)]
         self.socket_path = f"{self._folder}/dssmd.sock"
         self.start()
 
@@ -34,16 +37,24 @@ class Daemon:
             ready.settimeout(PATIENT_S)
             self._process = subprocess.Popen(
                 # It ends with the test, also if that crashes.
-                ["setpriv", "--pdeathsig", "KILL", BUILD / "daemon/dssmd", "--runtime-dir", self._folder, "--name", "pc1", "--chronyd", "127.0.0.1:1",
-                 "--mdns=false", "--listen", "127.0.0.1:0"], env=os.environ | {"NOTIFY_SOCKET": notify})
-            while b"READY=1" not in ready.recv(4096):
+                ["setpriv", "--pdeathsig", "KILL", BUILD / "daemon/dssmd", "--runtime-dir", self._folder, "--chronyd", "127.0.0.1:1",
+                 "--mdns=false", "--listen", "127.0.0.1:0", *self._flags], env=os.environ | {"NOTIFY_SOCKET": notify})
+            while b"READY=1" not in (message := ready.recv(4096)):
                 pass
+        self.address = re.search(r"listening at ([\d.:]+)", message.decode())[1]
         os.unlink(notify)
 
     def kill(self) -> None:
         """Ends it without a chance to clean up."""
         self._process.kill()
         self._process.wait()
+
+    def stop(self) -> None:
+        """Stops it until resume(), as if its host did not answer."""
+        self._process.send_signal(signal.SIGSTOP)
+
+    def resume(self) -> None:
+        self._process.send_signal(signal.SIGCONT)
 
     def close(self) -> None:
         """Ends it and removes its folder."""
