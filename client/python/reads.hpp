@@ -147,7 +147,7 @@ class Reads {
   // A view of the ring, which the reader unmaps when it restarts for the second time after it was
   // made: `restarts` of then.
   std::multiset<std::uint64_t>& leases() { return leases_; }
-  const std::shared_ptr<Raw>& shared_raw() const { return raw_; }
+  const std::shared_ptr<Raw>& shared_raw() const { return raw_; }  // null: closed
 
   // Raises an exception if a read could unmap memory that a view shows.
   void check_leases() const {
@@ -403,6 +403,7 @@ class FastReads {
 template <class Reader>
 void define_reads(py::class_<Reader, std::shared_ptr<Reader>>& type) {
   FastReads<Reader>::define(type);
+  const auto name = type.attr("__name__").template cast<std::string>();
   type.def(
           "previous", [](Reader& r) { return r.reads.previous(); },
           "The sample before the cursor; None if nothing was read before. Raises TooOld.")
@@ -438,6 +439,11 @@ void define_reads(py::class_<Reader, std::shared_ptr<Reader>>& type) {
           "UNKNOWN_CLOCK_ERROR.")
       .def(
           "close", [](Reader& r) { r.reads.close(); }, "Closes it; other calls then raise Closed.")
+      .def("__repr__",
+           [name](const Reader& r) {
+             if (r.reads.is_closed()) return "<dssm." + name + " closed>";
+             return repr_of(name, *r.reads.shared_raw());
+           })
       .def("__enter__", [](py::object self) { return self; })
       .def("__exit__", [](Reader& r, const py::args&) { r.reads.close(); })
       .def_property_readonly(

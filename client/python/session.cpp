@@ -11,6 +11,7 @@
 #include <cmath>
 #include <condition_variable>
 #include <cstdio>
+#include <cstdlib>
 #include <dssm/session.hpp>
 #include <memory>
 #include <mutex>
@@ -28,6 +29,7 @@ using namespace std::chrono_literals;
 struct Connection {
   std::optional<Session> session;  // empty: closed
   py::object on_notice;            // None: standard error
+  std::string socket_path;         // as shown
 
   // A copy, which stays usable when another thread closes this one.
   Session get() const {
@@ -45,6 +47,13 @@ std::string script_name() {
   return name == "-c" || name == "-" ? std::string() : name;
 }
 
+std::string shown_path(const SessionOptions& options) {
+  if (!options.socket_path.empty()) return options.socket_path;
+  // As Session::connect() has read it. NOLINTNEXTLINE(concurrency-mt-unsafe)
+  const char* const path = std::getenv("DSSM_SOCKET");
+  return path && *path ? path : "/run/dssm/dssmd.sock";
+}
+
 std::unique_ptr<Connection> connect(const std::string& socket_path, const std::string& program,
                                     py::handle request_timeout, const py::object& on_notice) {
   SessionOptions options;
@@ -54,6 +63,7 @@ std::unique_ptr<Connection> connect(const std::string& socket_path, const std::s
   auto connection = std::make_unique<Connection>();
   connection->session = value_without_gil([&] { return Session::connect(options); });
   connection->on_notice = on_notice;
+  connection->socket_path = shown_path(options);
   return connection;
 }
 
@@ -122,17 +132,35 @@ std::shared_ptr<Reader> open_reader(Connection& connection, std::string_view nam
                                   wanted);
 }
 
+// 0 for None.
+std::uint64_t to_depth(py::handle depth) {
+  if (depth.is_none()) return 0;
+  if (!PyIndex_Check(depth.ptr()) || PyBool_Check(depth.ptr())) {
+    throw py::type_error("depth is a whole number of slots, not " + std::string(py::repr(depth)));
+  }
+  const auto number = py::reinterpret_steal<py::object>(PyNumber_Index(depth.ptr()));
+  const std::uint64_t slots = PyLong_AsUnsignedLongLong(number.ptr());
+  if (PyErr_Occurred()) {  // negative, or too large
+    PyErr_Clear();
+    throw py::value_error("depth is a number of slots, not " + std::string(py::repr(number)));
+  }
+  return slots;
+}
+
 std::unique_ptr<Writer> create_stream(Connection& connection, std::string_view name,
                                       py::handle type, py::handle cycle, py::handle life,
-                                      std::optional<std::uint64_t> depth, bool keep_existing) {
+                                      py::handle depth, bool keep_existing) {
   const StreamId id = to_stream_id(name);
   const WantedType wanted = wanted_type(type);
-  if (!wanted.type)
-    throw py::type_error("create() needs the type of the stream's samples, not None");
-  if (life.is_none() == !depth.has_value()) {
-    throw py::type_error("create() needs how much history the stream keeps: either life or depth");
+  const std::string what = "create() of '" + id.str() + "' needs ";
+  if (!wanted.type) throw py::type_error(what + "type: of the stream's samples, such as 'f8'");
+  if (cycle.is_none()) {
+    throw py::type_error(what + "cycle: the expected time between two samples [s], such as 0.1");
   }
-  History history{depth.value_or(0), to_duration(cycle)};
+  if (life.is_none() == depth.is_none()) {
+    throw py::type_error(what + "how much history the stream keeps: either life [s] or depth");
+  }
+  History history{to_depth(depth), to_duration(cycle)};
   if (!life.is_none()) history = value_of(History::for_life(to_duration(life), history.cycle));
   Session session = connection.get();
   return std::make_unique<Writer>(value_without_gil([&] {
@@ -334,7 +362,7 @@ void define_sessions(py::module_& module) {
            py::arg("depth") = py::none(), py::arg("keep_existing") = false,
            "Creates a stream, if there is none of that type, and opens it for writing.\n\n"
            "type: as in reader().\n"
-           "cycle: the expected time between two samples.\n"
+           "cycle: the expected time between two samples; needed, as is the type.\n"
            "life: how long samples are kept, at one each cycle; or depth: slots for samples, one "
            "more than "
            "are kept.\n"
@@ -395,6 +423,12 @@ void define_sessions(py::module_& module) {
       .def(
           "close", [](Connection& c) { c.session.reset(); },
           "Closes the connection. Readers and writers remain usable.")
+      .def("__repr__",
+           [](const Connection& c) {
+             if (!c.session) return std::string("<dssm.Session closed>");
+             const char* const state = c.session->is_connected() ? "connected" : "not connected";
+             return "<dssm.Session " + c.socket_path + " " + state + ">";
+           })
       .def("__enter__", [](py::object self) { return self; })
       .def("__exit__", [](Connection& c, const py::args&) { c.session.reset(); });
 }

@@ -152,6 +152,18 @@ WantedType wanted_type(py::handle value) {
   return {both[0].cast<TypeInfo>(), both[1]};
 }
 
+namespace {
+
+std::string shown(const TypeInfo& type) {
+  return type.name.empty() ? "a type without a name" : "'" + type.name + "'";
+}
+
+void replace(std::string& text, const std::string& what, const std::string& by) {
+  if (const std::size_t at = text.find(what); at != text.npos) text.replace(at, what.size(), by);
+}
+
+}  // namespace
+
 void check_type(const StreamId& id, const TypeInfo& type, const WantedType& wanted) {
   if (!wanted.type) return;
   TypeInfo has = type, wants = *wanted.type;
@@ -164,7 +176,16 @@ void check_type(const StreamId& id, const TypeInfo& type, const WantedType& want
     wants.alignment_bytes = has.alignment_bytes;
   }
   if (const Result<void> usable = has.check_usable_as(wants); !usable) {
-    raise(Error(usable.error()).context("open '" + id.str() + "'"));
+    Error error = usable.error();
+    // Under their own names.
+    replace(error.message, "the stream carries '" + has.name + "'",
+            "the stream carries " + shown(type));
+    std::string name = shown(*wanted.type);
+    if (wanted.type->name.empty() && wanted.dtype.attr("names").is_none()) {
+      name = "dtype " + std::string(py::str(wanted.dtype));
+    }
+    replace(error.message, "this program wants '" + wants.name + "'", "this program wants " + name);
+    raise(std::move(error).context("open '" + id.str() + "'"));
   }
 }
 

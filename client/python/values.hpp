@@ -11,6 +11,7 @@
 #include <dssm/stream.hpp>
 #include <optional>
 #include <span>
+#include <string>
 
 #include "client/python/python.hpp"
 
@@ -81,5 +82,13 @@ WantedType wanted_type(py::handle value);
 // Fails with type_mismatch unless `type`, of a stream, is what the program wants. Other than
 // TypeInfo::check_usable_as(), also compares the fields of types without a name: numpy's have none.
 void check_type(const StreamId& id, const TypeInfo& type, const WantedType& wanted);
+
+// How an open reader or writer is shown: its stream with the host, its type, and the newest tid.
+template <class Raw>
+std::string repr_of(const std::string& name, const Raw& raw) {
+  const Tid newest = raw.newest_tid();
+  return "<dssm." + name + " " + raw.id().str() + ": " + raw.type().str() + ", " +
+         (newest == kNoTid ? "nothing written" : "newest tid " + std::to_string(newest)) + ">";
+}
 
 }  // namespace dssm::python

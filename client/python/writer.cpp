@@ -60,6 +60,10 @@ void define_writers(py::module_& module) {
             w.raw.reset();
           },
           "Closes it; other calls then raise Closed. The stream remains.")
+      .def("__repr__",
+           [](const Writer& w) {
+             return w.raw ? repr_of("Writer", *w.raw) : std::string("<dssm.Writer closed>");
+           })
       .def("__enter__", [](py::object self) { return self; })
       .def("__exit__",
            [](Writer& w, const py::args&) {

@@ -105,6 +105,23 @@ class Sessions(Case):
             with self.assertRaises(dssm.Closed):
                 call()
 
+    def test_what_objects_show(self):
+        session = dssm.Session()
+        writer = session.create("shown", Pose, depth=8, cycle=0.1)
+        reader = session.reader("shown")
+        scalar = session.create("scalar", "f8", depth=8, cycle=0.1)
+        self.assertEqual(repr(session), f"<dssm.Session {self.daemon.socket_path} connected>")
+        self.assertEqual(repr(reader), "<dssm.Reader shown:0@pc1: 'Pose' (16 bytes, aligned to 8), nothing written>")
+        self.assertEqual(repr(scalar), "<dssm.Writer scalar:0@pc1: 8 bytes, nothing written>")
+        for _ in range(3):
+            writer.write((1.0, 2.0))
+        self.assertEqual(repr(reader), "<dssm.Reader shown:0@pc1: 'Pose' (16 bytes, aligned to 8), newest tid 2>")
+        self.assertEqual(repr(writer), repr(reader).replace("Reader", "Writer"))
+        for each in (reader, writer, scalar, session):
+            each.close()
+        self.assertEqual([repr(each) for each in (reader, writer, session)],
+                         ["<dssm.Reader closed>", "<dssm.Writer closed>", "<dssm.Session closed>"])
+
     def test_playback_clock(self):
         clock = self.session.playback_clock()
         clock.set_paused(True)
@@ -298,6 +315,18 @@ class Types(Case):
             self.session.writer("typed", Other)
         self.session.reader("typed", np.dtype([("x", "f8"), ("y", "f8")])).close()  # a dtype has no name
 
+    def test_a_wrong_dtype_is_shown_under_no_name_of_the_stream(self):
+        scan = np.dtype([("range", "f4", 2)])
+        self.create("scans", dssm.type_info(scan, "Scan"))
+        self.create("nameless", scan)
+        shown = "^open 'scans:0@pc1': the stream carries 'Scan' \\(8 bytes.*, this program wants "
+        for stream, wanted, text in (
+                ("scans", "f8", shown + "dtype float64 \\(8 bytes"), ("scans", np.dtype([("x", "f8")]), shown + "a type without a name \\(8"),
+                ("scans", Pose, shown + "'Pose' \\(16"), ("scans", ("i4", 2), shown + "dtype \\('<i4', \\(2,\\)\\) \\(8"),
+                ("nameless", Pose, "the stream carries a type without a name \\(8 .* wants 'Pose'")):
+            with self.subTest(stream=stream, wanted=wanted), self.assertRaisesRegex(dssm.TypeMismatch, text):
+                self.session.reader(stream, wanted)
+
     def test_unnamed_types_are_compared_too(self):
         self.create("unnamed", np.dtype([("x", "f8")]))
         with self.assertRaises(dssm.TypeMismatch):
@@ -325,6 +354,16 @@ class Types(Case):
         for options in ({}, {"life": 10}, {"cycle": 1}, {"life": 10, "cycle": 1, "depth": 3}):
             with self.subTest(options=options), self.assertRaises(TypeError):
                 self.session.create("unlived", "f8", **options)
+
+    def test_create_names_what_is_missing(self):
+        for arguments, options, text in (
+                (("x",), {}, "needs type"), (("x", "f8"), {}, "needs cycle"), (("x", "f8"), {"depth": 8}, "needs cycle"),
+                (("x", "f8"), {"cycle": 0.1}, "either life \\[s\\] or depth"), (("x", "f8"), {"cycle": 0.1, "depth": 2.5}, "depth is a whole number")):
+            with self.subTest(options=options), self.assertRaisesRegex(TypeError, text):
+                self.session.create(*arguments, **options)
+        for depth in (-1, 1 << 64):
+            with self.subTest(depth=depth), self.assertRaisesRegex(ValueError, f"not {depth}$"):
+                self.session.create("x", "f8", cycle=0.1, depth=depth)
 
 
 class Reads(Case):
