@@ -18,7 +18,9 @@
 #   Compiling many sources at once hides a missing include. This looks only at functions outside of
 #   classes whose names no other header declares; `./check alone` finds all.
 # * A path of the sources in README.md or a document of docs/, and the target of a link, exists.
+# * Files of others, which are in the tree unchanged, are what the SHA256SUMS of their folder says.
 import glob
+import hashlib
 import os
 import re
 import sys
@@ -260,9 +262,29 @@ def document_errors(root):
                 yield f"{os.path.relpath(path, root)}: there is no {os.path.relpath(name, root)}"
 
 
+def checksum_errors(root):
+    for sums in sorted(glob.glob(os.path.join(root, "client/**/SHA256SUMS"), recursive=True)):
+        folder = os.path.dirname(sums)
+        where = os.path.relpath(folder, root)
+        with open(sums, encoding="utf-8") as file:
+            expected = dict(reversed(line.split(maxsplit=1)) for line in file.read().splitlines())
+        for name in sorted({*expected, *os.listdir(folder)} - {"SHA256SUMS"}):
+            path = os.path.join(folder, name)
+            if not os.path.exists(path):
+                yield f"{where}: there is no {name}, which SHA256SUMS lists"
+            elif name not in expected:
+                yield f"{where}/{name} is not in SHA256SUMS: sha256sum {name} >> SHA256SUMS"
+            else:
+                with open(path, "rb") as file:
+                    found = hashlib.sha256(file.read()).hexdigest()
+                if found != expected[name]:
+                    yield (f"{where}/{name} is not the file that SHA256SUMS lists: files of others "
+                           "stay unchanged; for a new version write its checksum there")
+
+
 def main(root):
     errors = [*include_errors(root), *hiding_errors(root), *comment_errors(root),
-              *missing_include_errors(root), *document_errors(root)]
+              *missing_include_errors(root), *document_errors(root), *checksum_errors(root)]
     for error in errors:
         print(error)
     return 1 if errors else 0
