@@ -281,7 +281,8 @@ class IsolatedTests:
         output = self.playbooks.refused("site.yml", dssm_alerts=True)
         assert "does not contain dssm-view" in output, output[-2000:]
         variables = {"dssm_packages": packages, "dssm_alerts": True,
-                     "dssm_view": {"listen": "127.0.0.1:8766"}}
+                     "dssm_view": {"listen": "127.0.0.1:8766"},
+                     "dssm_grafana_provisioning": "/etc/grafana/provisioning"}
         assert self.playbooks.run("site.yml", **variables) > 0
         assert self.playbooks.run("site.yml", **variables) == 0, "a second run changes something"
         prometheus = "http://127.0.0.1:9090/api/v1/"
@@ -290,6 +291,10 @@ class IsolatedTests:
         wait_until(lambda: '"host":"pc1"' in get(self.container,
                                                  prometheus + "query?query=dssm_host_up"),
                    "Prometheus has no metrics")
+        # Debian has no Grafana that could show it.
+        dashboards = "/etc/grafana/provisioning/dashboards"
+        assert f"path: {dashboards}/dssm\n" in self.container.run("cat", f"{dashboards}/dssm.yaml")
+        self.container.run("grep", "dssm_host_up", f"{dashboards}/dssm/dssm-dashboard.json")
         assert self.playbooks.run("site.yml", dssm_packages=packages) > 0
         wait_until(lambda: "<title>" in get(self.container, "http://127.0.0.1:8765/"),
                    "it does not listen where it does by default")
