@@ -202,7 +202,8 @@ void add_streams(std::string& text, const std::vector<StreamInfo>& streams) {
                    ? Number()
                    : Number(static_cast<double>(to_ns(stream.newest_time)) * 1e-9);
       });
-  add("dssm_stream_stalled", "gauge", "1: no sample came for longer than the stream ever pauses.",
+  add("dssm_stream_stalled", "gauge",
+      "1: no sample came for longer than the stream ever pauses, or nothing can write to it.",
       [&](const StreamInfo& stream) {
         return is_age_known(stream) ? Number(is_silent(stream) ? 1 : 0) : Number();
       });

@@ -107,6 +107,24 @@ TEST_F(Metrics, AreOpenMetrics) {
   EXPECT_TRUE(contains(parsed.out, "dssm_ring_memory_bytes gauge bytes\n")) << parsed.out;
 }
 
+// A stream also counts as stalled when nothing can write to it, which an alert depends on.
+TEST_F(Metrics, StateWhatStalledMeansAsTheManualDoes) {
+  auto lidar = session_.create<double>("lidar", depth_of(8)).value();
+  lidar.write(1);  // what is not known of any stream is left out
+  std::string help;
+  await([&] {
+    for (const std::string& line : lines_of(output({"metrics"}))) {
+      constexpr std::string_view kHelp = "# HELP dssm_stream_stalled ";
+      if (line.starts_with(kHelp)) help = line.substr(kHelp.size());
+    }
+    return !help.empty();
+  });
+  ASSERT_TRUE(help.ends_with('.')) << help;
+  help.pop_back();
+  const std::string row = "| `dssm_stream_stalled` | the same | " + help + " |";
+  EXPECT_TRUE(contains(text_of(source("docs/metrics.md")), row)) << row;
+}
+
 TEST_F(Metrics, HaveNoOtherFormat) {
   const Finished refused = ctl({"metrics", "--json"});
   EXPECT_EQ(refused.exit_status, 2);
