@@ -11,11 +11,13 @@
 #include <cmath>
 #include <cstring>
 #include <filesystem>
+#include <optional>
 
 #include "client/dssmctl/chart.hpp"
 #include "client/dssmctl/describe_stream.hpp"
 #include "client/dssmctl/draw.hpp"
 #include "client/dssmctl/fields.hpp"
+#include "client/dssmctl/keyboard.hpp"
 #include "client/dssmctl/names.hpp"
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/options.hpp"
@@ -161,15 +163,16 @@ bool knows_braille() {
   return is_utf8;
 }
 
-// All curves, one below the other, as high as the terminal has room.
-void print_charts(const std::vector<Curve>& curves, Time end, Duration span, Output& out) {
+// All curves, one below the other, as high as the terminal has room, and the keys at the bottom.
+void print_charts(const std::vector<Curve>& curves, Time end, Duration span, bool has_keys,
+                  Output& out) {
   winsize window{};
   const bool is_known = ::ioctl(STDOUT_FILENO, TIOCGWINSZ, &window) == 0 && window.ws_row > 0;
   const std::size_t rows = is_known ? window.ws_row : 24, columns = is_known ? window.ws_col : 80;
   ChartSize size;
   size.columns = std::max<std::size_t>(columns, 32) - 12;
-  // A title for each, the time axis, and the line in which the cursor stands.
-  const std::size_t used = curves.size() + 2;
+  // A title for each, the time axis, the keys, and the line in which the cursor stands.
+  const std::size_t used = curves.size() + 3;
   size.rows = std::max<std::size_t>(rows > used ? (rows - used) / curves.size() : 0, 2);
   const bool plain = !knows_braille();
   for (const Curve& curve : curves) {
@@ -182,6 +185,17 @@ void print_charts(const std::vector<Curve>& curves, Time end, Duration span, Out
   const std::string right = end == Time::min() ? "nothing yet" : time_text(end, true);
   out.add(fmt::format("{:11}{:<{}}{}\n", "", left,
                       size.columns > right.size() ? size.columns - right.size() : 0, right));
+  out.add(has_keys ? "q quit\n" : "Ctrl-C quit\n");
+}
+
+// Sleeps until `due`. False: it must stop, or q was pressed.
+bool sleep_unless_quit(MonoTime due, Keyboard& keyboard, Output& out) {
+  while (!out.must_stop()) {
+    if (MonoClock::now() >= due) return true;
+    const MonoTime check = std::min(due, deadline_in(kStopCheckPeriod));
+    if (keyboard.wait(check) == Key::q) return false;
+  }
+  return false;
 }
 
 void print_row(const std::vector<Curve>& curves, Time end, bool json, bool iso, Output& out) {
@@ -266,14 +280,17 @@ Result<void> run(const PlotOptions& options, Output& out) {
   const bool is_drawn = out.terminal() && !options.json;
   const MonoTime end = options.duration ? deadline_in(*options.duration) : kNever;
   const Duration period = is_drawn ? kScreenPeriod : kRowPeriod;
+  std::optional<Keyboard> keyboard;  // rows may be in a pipe: the terminal's keys are not theirs
+  if (is_drawn) keyboard.emplace();
   // After a pause of this program not for each period that it missed.
   for (MonoTime next = MonoClock::now();; next = std::max(next + period, MonoClock::now())) {
-    if (!out.sleep_until(std::min(next, end))) return {};
+    const MonoTime due = std::min(next, end);
+    if (!(keyboard ? sleep_unless_quit(due, *keyboard, out) : out.sleep_until(due))) return {};
     DSSM_TRY(read_all(curves, options.span));
     Time newest = Time::min();
     for (const Curve& curve : curves) newest = std::max(newest, curve.newest());
     if (is_drawn) {
-      print_charts(curves, newest, options.span, out);
+      print_charts(curves, newest, options.span, keyboard->is_there(), out);
       if (!out.flush_screen()) return {};
     } else {
       print_row(curves, newest, options.json, options.iso, out);

@@ -4,6 +4,10 @@
 #include <pty.h>
 #include <signal.h>
 #include <sys/ioctl.h>
+#include <termios.h>
+
+#include <algorithm>
+#include <utility>
 
 #include "tests/process/dssmctl/fleet_test.hpp"
 #include "tests/support/folder.hpp"
@@ -12,6 +16,7 @@ namespace dssm::test {
 namespace {
 
 using namespace std::chrono_literals;
+using Strings = std::vector<std::string>;
 
 struct Wave {
   double height;
@@ -84,34 +89,78 @@ TEST_F(Plot, WritesFilesByGnuplot) {
                        "does not end in .svg or .png"));
 }
 
-TEST_F(Plot, DrawsOnATerminal) {
+class PlotOnATerminal : public Plot {
+ protected:
+  ~PlotOnATerminal() override {
+    if (pid_ > 0) ::kill(pid_, SIGKILL), wait_for(pid_);
+    if (terminal_ >= 0) ::close(terminal_);
+  }
+
+  void plot(Strings words) {
+    words.insert(words.begin(), "plot");
+    const winsize size{.ws_row = 12, .ws_col = 60, .ws_xpixel = 0, .ws_ypixel = 0};
+    words = argv(words);
+    std::vector<char*> pointers;
+    for (std::string& word : words) pointers.push_back(word.data());
+    pointers.push_back(nullptr);
+    std::string socket = environment().front();
+    pid_ = ::forkpty(&terminal_, nullptr, nullptr, &size);
+    if (pid_ == 0) {
+      ::putenv(socket.data());
+      ::setenv("LC_ALL", "C.UTF-8", 1);
+      ::execv(pointers[0], pointers.data());
+      ::_exit(127);
+    }
+  }
+
+  // Until the terminal has got all of these.
+  void await_shown(const Strings& parts) {
+    const auto is_missing = [&](const std::string& part) { return !contains(shown_, part); };
+    while (std::any_of(parts.begin(), parts.end(), is_missing)) {
+      ASSERT_TRUE(read_some()) << shown_;
+      if (shown_.size() > 100'000) FAIL() << shown_;
+    }
+  }
+  bool read_some() {
+    char buffer[4096];
+    const ssize_t got = ::read(terminal_, buffer, sizeof buffer);
+    if (got > 0) shown_.append(buffer, static_cast<std::size_t>(got));
+    return got > 0;
+  }
+
+  // Reads all until the program has ended, and returns its status.
+  int end() {
+    while (read_some()) {
+    }
+    return wait_for(std::exchange(pid_, -1));
+  }
+
+  std::string shown_;
+  pid_t pid_ = -1;
+  int terminal_ = -1;
+};
+
+TEST_F(PlotOnATerminal, DrawsUntilCtrlC) {
   write(50);
-  int terminal = -1;
-  winsize size{.ws_row = 12, .ws_col = 60, .ws_xpixel = 0, .ws_ypixel = 0};
-  std::vector<std::string> words = argv({"plot", "a.wave.height"});
-  std::vector<char*> pointers;
-  for (std::string& word : words) pointers.push_back(word.data());
-  pointers.push_back(nullptr);
-  std::string socket = environment().front();
-  const pid_t pid = ::forkpty(&terminal, nullptr, nullptr, &size);
-  if (pid == 0) {
-    ::putenv(socket.data());
-    ::setenv("LC_ALL", "C.UTF-8", 1);
-    ::execv(pointers[0], pointers.data());
-    ::_exit(127);
-  }
-  std::string shown;
-  char buffer[4096];
-  // The newest value, then the right end of the ramp, which is at the top.
-  while (!contains(shown, "24.5") || !contains(shown, "\xe2\xa0\x8a")) {
-    const ssize_t got = ::read(terminal, buffer, sizeof buffer);
-    ASSERT_GT(got, 0) << shown;
-    shown.append(buffer, static_cast<std::size_t>(got));
-    if (shown.size() > 100'000) FAIL() << shown;
-  }
-  const EndingSignal sent(pid, SIGINT);
-  EXPECT_EQ(wait_for(pid), 0);
-  ::close(terminal);
+  plot({"a.wave.height"});
+  // The newest value, the right end of the ramp, which is at the top, and the keys.
+  await_shown({"24.5", "\xe2\xa0\x8a", "q quit"});
+  const EndingSignal sent(pid_, SIGINT);
+  EXPECT_EQ(end(), 0);
+}
+
+TEST_F(PlotOnATerminal, EndsByQ) {
+  write(50);
+  plot({"a.wave.height", "a.wave.ranges[2]"});
+  await_shown({"24.5", "q quit"});
+  ASSERT_EQ(::write(terminal_, "xq", 2), 2);  // another key does nothing
+  EXPECT_EQ(end(), 0);
+  // Of two charts no line was cut off: the keys come last, and nothing typed is among them.
+  EXPECT_TRUE(contains(shown_, "q quit\x1b[K\r\n\x1b[J")) << shown_;
+  EXPECT_FALSE(contains(shown_, "xq")) << shown_;
+  termios now{};
+  ASSERT_EQ(::tcgetattr(terminal_, &now), 0);
+  EXPECT_TRUE(now.c_lflag & ECHO);
 }
 
 }  // namespace
