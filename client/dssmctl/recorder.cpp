@@ -332,7 +332,9 @@ Result<void> Recorder::end() {
   return completed;
 }
 
-Result<void> Recorder::take() {
+Result<void> Recorder::take() { return take_until(WallClock::now() - kHeldFor); }
+
+Result<void> Recorder::take_until(Time held_from) {
   auto properties = opener_.take_properties();
   // All, also when the file cannot take them, because its disk is full: the next file will.
   Result<void> added;
@@ -354,15 +356,13 @@ Result<void> Recorder::take() {
   check_readers();
   std::optional<Time> until;
   for (const Source& source : sources_) {
-    const std::optional<Time> time = next_past(source);
+    const std::optional<Time> time = is_of_past(source) ? next_time(source) : std::nullopt;
     if (time && (!until || *time < *until)) until = time;
   }
   if (until) until = saturating_add(*until, kPastPart);
   is_more_ = false;
-  for (Source& source : sources_) {
-    if (DSSM_TRY(take(source, until))) is_more_ = true;
-    DSSM_TRY(write_properties(source, false));
-  }
+  DSSM_TRY(take_in_order(until, held_from));
+  for (Source& source : sources_) DSSM_TRY(write_properties(source, false));
   next_take_ = is_more_ ? MonoClock::now() : deadline_in(next_period());
   return {};
 }
@@ -453,8 +453,7 @@ Result<void> Recorder::write_properties(Source& source, bool all) {
   return {};
 }
 
-std::optional<Time> Recorder::next_past(const Source& source) {
-  if (source.next > source.past_until) return std::nullopt;
+std::optional<Time> Recorder::next_time(const Source& source) {
   SampleInfo info;
   const Tid next = std::max(source.reader.cursor() + 1, source.reader.oldest_tid());
   if (source.reader.read_info(next, info) != ReadStatus::ok) return std::nullopt;
@@ -506,36 +505,65 @@ void Recorder::check_readers() {
   });
 }
 
-Result<bool> Recorder::take(Source& source, std::optional<Time> until) {
-  std::uint64_t bytes = 0, samples = 0;
-  while (bytes < kTurnBytes) {
-    if (until) {
-      const std::optional<Time> time = next_past(source);
-      if (time && *time > *until) return true;
-    }
-    payload_.resize(source.reader.payload_bytes());
-    SampleInfo info;
-    const ReadStatus status = source.reader.read_next(payload_, info);
-    if (status == ReadStatus::restarted) {
-      source.property.clear();  // dssmd reports the one that it has
-      DSSM_TRY(add_to_file(source));
-      source.next = 0;
-      source.past_until = kNoTid;
-      source.from.reset();
-      continue;
-    }
-    if (status != ReadStatus::ok) break;
-    bytes += payload_.size();
-    ++samples;
-    if ((source.from && info.time < *source.from) || (source.until && info.time > *source.until)) {
-      source.next = info.tid + 1;
-      continue;
-    }
-    DSSM_TRY(write(source, info));
+Result<void> Recorder::take_in_order(std::optional<Time> past_until, Time held_from) {
+  constexpr auto kLaterLast = [](const Turn& a, const Turn& b) { return a.next > b.next; };
+  turns_.clear();
+  for (Source& source : sources_) {
+    turns_.push_back({&source, next_time(source).value_or(Time::max())});
   }
-  filled_ = std::max(filled_,
-                     static_cast<double>(samples) / static_cast<double>(source.reader.depth() - 1));
-  return bytes >= kTurnBytes;
+  std::ranges::make_heap(turns_, kLaterLast);
+  while (!turns_.empty()) {
+    std::ranges::pop_heap(turns_, kLaterLast);
+    Turn& turn = turns_.back();
+    Source& source = *turn.source;
+    const bool is_known = turn.next != Time::max();
+    const bool is_later = is_known && past_until && is_of_past(source) && turn.next > *past_until;
+    const bool is_much = turn.bytes >= kTurnBytes;
+    if (is_later || is_much) is_more_ = true;
+    const bool must_wait = is_later || is_much || (is_known && is_held(turn, held_from));
+    if (!must_wait && DSSM_TRY(take_next(turn))) {
+      turn.next = next_time(source).value_or(Time::max());
+      std::ranges::push_heap(turns_, kLaterLast);
+      continue;
+    }
+    const auto slots = static_cast<double>(source.reader.depth() - 1);
+    filled_ = std::max(filled_, static_cast<double>(turn.samples) / slots);
+    turns_.pop_back();
+  }
+  return {};
+}
+
+// Not when too little of its ring is left for those that come meanwhile; nor samples with stamps of
+// another time.
+bool Recorder::is_held(const Turn& turn, Time held_from) {
+  if (turn.next <= held_from || turn.next - held_from > 2 * kHeldFor) return false;
+  const RawReader& reader = turn.source->reader;
+  const auto waiting = static_cast<double>(reader.newest_tid() - reader.cursor());
+  return waiting <= kFilled * static_cast<double>(reader.depth() - 1);
+}
+
+Result<bool> Recorder::take_next(Turn& turn) {
+  Source& source = *turn.source;
+  payload_.resize(source.reader.payload_bytes());
+  SampleInfo info;
+  const ReadStatus status = source.reader.read_next(payload_, info);
+  if (status == ReadStatus::restarted) {
+    source.property.clear();  // dssmd reports the one that it has
+    DSSM_TRY(add_to_file(source));
+    source.next = 0;
+    source.past_until = kNoTid;
+    source.from.reset();
+    return true;
+  }
+  if (status != ReadStatus::ok) return false;
+  turn.bytes += payload_.size();
+  ++turn.samples;
+  if ((source.from && info.time < *source.from) || (source.until && info.time > *source.until)) {
+    source.next = info.tid + 1;
+    return true;
+  }
+  DSSM_TRY(write(source, info));
+  return true;
 }
 
 Result<void> Recorder::write(Source& source, const SampleInfo& info) {
@@ -575,7 +603,7 @@ Result<void> Recorder::complete() {
   const MonoTime end = deadline_in(kEndingTime);
   Result<void> taken;
   do {
-    taken = take();
+    taken = take_until(Time::max());
   } while (taken && is_more_ && MonoClock::now() < end);  // writers may be faster
   // One that was set just now is not reported yet.
   for (Source& source : sources_) {

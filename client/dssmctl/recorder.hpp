@@ -111,6 +111,9 @@ class Recorder {
   // The past is recorded in parts of this length, each of all streams, so that the recording is
   // about in the order of times.
   static constexpr Duration kPastPart = std::chrono::milliseconds(100);
+  // So long samples wait in their rings for earlier ones of other streams, which were measured or
+  // sent before they were written: recorded in the order of times, they are played as they were.
+  static constexpr Duration kHeldFor = std::chrono::milliseconds(100);
   // What one stream may have taken before the others have their turn.
   static constexpr std::uint64_t kTurnBytes = 4U << 20;
   // So long a property waits for its first sample, whose time is its own in the file.
@@ -220,11 +223,23 @@ class Recorder {
   Result<void> add(Source source);
   Result<void> add_to_file(Source& source);
   void want_past(Source& source) const;
-  // Whether there may be more at once.
-  //   until  not beyond samples of that time
-  Result<bool> take(Source& source, std::optional<Time> until);
-  // The time of the next sample of the past; empty: there is none, or it is not here.
-  static std::optional<Time> next_past(const Source& source);
+  // take(); samples that are later than `held_from` may wait for earlier ones of other streams.
+  Result<void> take_until(Time held_from);
+  // A stream in a turn of take().
+  struct Turn {
+    Source* source = nullptr;
+    Time next;  // the time of its next sample; max(): it has none, as far as is known
+    std::uint64_t bytes = 0, samples = 0;  // that were taken
+  };
+  // Takes the samples of all streams in the order of their times.
+  //   past_until  samples of the past that are later than this wait
+  Result<void> take_in_order(std::optional<Time> past_until, Time held_from);
+  // Its next sample. Whether there may be another one.
+  Result<bool> take_next(Turn& turn);
+  static bool is_held(const Turn& turn, Time held_from);
+  static bool is_of_past(const Source& source) { return source.next <= source.past_until; }
+  // The time of the next sample; empty: there is none, or it is not here.
+  static std::optional<Time> next_time(const Source& source);
   // What cannot be read any more is opened again.
   void check_readers();
   static void follow_restart(Source& source);
@@ -245,6 +260,7 @@ class Recorder {
   Duration before_{};   // the same, before begin()
   Opener opener_;
   std::vector<Source> sources_;
+  std::vector<Turn> turns_;  // in take_in_order(), the earliest next one first
   std::vector<std::byte> payload_;
   Time newest_time_ = Time::min();  // of the samples in the file
   double filled_ = 0;               // the greatest part of a ring that was new in this turn

@@ -245,6 +245,35 @@ TEST_F(Record, OfThePastIsInTheOrderOfTimesOfAllStreams) {
   EXPECT_EQ(samples, 2000);
 }
 
+// Samples of `late` are written 20 ms after their times, as those of a LIDAR are.
+TEST_F(Record, IsInTheOrderOfTimesOfAllStreams) {
+  auto prompt = session_.create<RecordedPose>("prompt", depth_of(4096)).value();
+  auto late = session_.create<RecordedPose>("late", depth_of(4096)).value();
+  Running running(argv({"record", "-o", file_}), environment());
+  await_reader(prompt.id());
+  await_reader(late.id());
+  constexpr int kPrompt = 500, kLate = 50;
+  for (int i = 0; i < kPrompt; ++i) {
+    const Time now = WallClock::now();
+    prompt.write({0, 0, i}, now);
+    if (i % (kPrompt / kLate) == 0) late.write({0, 0, i}, now - 20ms);
+    std::this_thread::sleep_for(1ms);  // the stream's cycle
+  }
+  running.signal(SIGINT);
+  EXPECT_EQ(running.status(), 0);
+  const Recording recording = Recording::open(file_).value();
+  RecordingCursor cursor = recording.cursor();
+  Time newest{};
+  int samples = 0, disordered = 0;
+  for (RecordedSample sample; cursor.next(sample); ++samples) {
+    disordered += sample.info.time < newest ? 1 : 0;
+    newest = std::max(newest, sample.info.time);
+  }
+  EXPECT_EQ(samples, kPrompt + kLate);
+  // This program may stand still between the write of one stream and that of the other.
+  EXPECT_LE(disordered, kLate / 10);
+}
+
 TEST_F(Record, TakesOnlyStreamsOfATypeIfAsked) {
   auto pose = session_.create<RecordedPose>("pose", depth_of(64)).value();
   auto number = session_.create<double>("number", depth_of(64)).value();
