@@ -159,6 +159,8 @@ Result<void> run(const RecordOptions& options, Output& out) {
   Session session = DSSM_TRY(connect(options));
   RecordingOptions how;
   how.compression = compression_of(options.compression);
+  // With the time that samples wait in their rings, at most a second is missing after a kill.
+  how.chunk_age = std::chrono::milliseconds(800);
   RecorderPlan plan{StreamFilter(options.hosts, options.patterns),
                     options.types,
                     options.past,
