@@ -144,8 +144,17 @@ Result<void> serve(Options options) {
   }
   const std::uint16_t port = DSSM_TRY(server.listen());
   if (session) {
-    collector->start(
-        [&](const VehicleState& state) { server.post([&, state] { on_state(state); }); });
+    collector->start([&](const VehicleState& state) {
+      server.post([&, known = VehicleState(state)]() mutable {
+        for (std::size_t i = 0; i < known.streams.size(); ++i) {
+          if (const auto oldest = streams.known_oldest(known.streams[i], known.host)) {
+            known.set_oldest(i, *oldest);
+          }
+        }
+        show_oldest(known);
+        on_state(known);
+      });
+    });
   } else {
     on_state(*recorded);
   }

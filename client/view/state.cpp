@@ -9,6 +9,7 @@
 #include "client/dssmctl/doctor.hpp"
 #include "client/dssmctl/nodes.hpp"
 #include "client/dssmctl/text.hpp"
+#include "client/view/streams.hpp"
 #include "core/base/try.hpp"
 
 namespace dssm::view {
@@ -17,7 +18,7 @@ namespace {
 using ctl::Json;
 
 // The time of the oldest sample that the stream's ring holds, about: by its rate.
-std::optional<Time> oldest_time(const StreamInfo& stream) {
+std::optional<Time> guessed_oldest(const StreamInfo& stream) {
   if (stream.newest == kNoTid) return std::nullopt;
   const double cycle_s =
       stream.rate_hz > 0 ? 1 / stream.rate_hz : std::chrono::duration<double>(stream.cycle).count();
@@ -46,23 +47,13 @@ bool is_about_now(Time time) {
          ctl::saturating_sub(WallClock::now(), time) < kDay;
 }
 
-// range: of the samples that are about now; if there are none, of all.
-Json streams_json(const std::vector<StreamInfo>& streams, std::optional<TimeRange>& range) {
-  range.reset();
-  std::optional<TimeRange> of_others;
+Json streams_json(const std::vector<StreamInfo>& streams) {
   Json list = Json::array();
   for (const StreamInfo& stream : streams) {
-    const std::optional<Time> oldest = oldest_time(stream);
     Json json = ctl::stream_json(stream);
-    json["oldest_ns"] = oldest ? time_json(*oldest) : Json();
-    json["newest_ns"] = oldest ? time_json(stream.newest_time) : Json();
     json["mirror"] = stream.mirror ? ctl::mirror_json(stream) : Json();
     list.push_back(std::move(json));
-    // Samples of a black box may be hours older than all others.
-    if (!oldest || ctl::is_of_black_box(stream.id)) continue;
-    extend(is_about_now(stream.newest_time) ? range : of_others, *oldest, stream.newest_time);
   }
-  if (!range) range = of_others;
   return list;
 }
 
@@ -141,6 +132,23 @@ VehicleState recorded_state(const Recording& recording) {
   return state;
 }
 
+void show_oldest(VehicleState& state) {
+  state.range.reset();
+  std::optional<TimeRange> of_others;
+  for (std::size_t i = 0; i < state.streams.size(); ++i) {
+    const StreamInfo& stream = state.streams[i];
+    const std::optional<Time> oldest = state.oldest[i];
+    Json& json = state.json["streams"][i];
+    json["oldest_ns"] = oldest ? time_json(*oldest) : Json();
+    json["newest_ns"] = oldest ? time_json(stream.newest_time) : Json();
+    // Samples of a black box may be hours older than all others.
+    if (!oldest || ctl::is_of_black_box(stream.id)) continue;
+    extend(is_about_now(stream.newest_time) ? state.range : of_others, *oldest, stream.newest_time);
+  }
+  if (!state.range) state.range = of_others;
+  state.json["range"] = range_json(state.range);
+}
+
 void show_warnings(const Recording& recording, VehicleState& state) {
   std::vector<ctl::Finding> findings;
   for (const std::string& warning : recording.warnings()) {
@@ -205,8 +213,9 @@ Result<void> StateCollector::collect(bool all) {
   Json& json = state_.json;
   json["host"] = daemon.host;
   json["version"] = daemon.version;
-  json["streams"] = streams_json(state_.streams, state_.range);
-  json["range"] = range_json(state_.range);
+  json["streams"] = streams_json(state_.streams);
+  find_oldest(all);
+  show_oldest(state_);
   json["hosts"] = Json::array();
   for (const HostInfo& host : hosts) {
     // Another address of a host that is there already.
@@ -231,6 +240,47 @@ Result<void> StateCollector::collect(bool all) {
   options.verb_name = "doctor";
   json["findings"] = ctl::findings_json(ctl::findings_of(ctl::collect_facts(options)));
   return {};
+}
+
+void StateCollector::find_oldest(bool all) {
+  state_.oldest.clear();
+  std::vector<std::pair<MonoTime, std::size_t>> due;  // by the times of their last probes
+  std::map<std::string, Probe> known;
+  for (std::size_t i = 0; i < state_.streams.size(); ++i) {
+    const StreamInfo& stream = state_.streams[i];
+    state_.oldest.push_back(guessed_oldest(stream));
+    if (stream.newest == kNoTid || stream.id.host != state_.host) continue;
+    const auto probed = probes_.find(stream.id.str());
+    const bool is_known =
+        probed != probes_.end() && probed->second.incarnation == stream.incarnation;
+    if (!is_known || probed->second.oldest != stream.oldest) {
+      due.emplace_back(is_known ? probed->second.at : MonoTime(), i);
+    }
+    if (is_known) known.insert(*probed);
+  }
+  probes_ = std::move(known);
+  std::ranges::sort(due);
+  if (due.size() > kMaxProbes) due.resize(kMaxProbes);
+  for (const auto& [at, i] : due) {
+    if (all) probe(state_.streams[i]);
+  }
+  for (std::size_t i = 0; i < state_.streams.size(); ++i) {
+    const StreamInfo& stream = state_.streams[i];
+    const auto probed = probes_.find(stream.id.str());
+    if (probed == probes_.end() || !probed->second.time) continue;
+    // A ring that was not probed now has lost about as much as has come since.
+    const bool is_moving = probed->second.oldest < stream.oldest;
+    const Duration since = is_moving ? MonoClock::now() - probed->second.at : Duration();
+    state_.set_oldest(i, ctl::saturating_add(*probed->second.time, since));
+  }
+}
+
+// Its reader is closed at once: the programs of a vehicle are not to see one more of each stream.
+void StateCollector::probe(const StreamInfo& stream) {
+  Probe& probe = probes_[stream.id.str()];
+  probe = {stream.incarnation, stream.oldest, MonoClock::now(), std::nullopt};
+  const Result<RawReader> reader = session_.open_raw_reader(stream.id);
+  if (reader && reader->incarnation() == stream.incarnation) probe.time = oldest_time(*reader);
 }
 
 void StateCollector::find_events(const std::vector<HostInfo>& hosts) {

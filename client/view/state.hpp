@@ -35,11 +35,21 @@ struct TimeRange {
 struct VehicleState {
   std::string host;
   std::vector<StreamInfo> streams;
+  std::vector<std::optional<Time>> oldest;  // of each stream: of its oldest sample, about
   std::vector<NodeInfo> nodes;
   std::optional<TimeRange> range;  // of all samples, about; empty: there are none
   bool has_all = false;            // also programs and findings are of now
   ctl::Json json;  // an answer to "overview" of the page's protocol (docs/view.md), without its id
+
+  // What a reader of streams[i] has found. Not if its times ran backwards in between.
+  void set_oldest(std::size_t i, Time time) {
+    if (oldest[i] && time <= streams[i].newest_time) oldest[i] = time;
+  }
 };
+
+// The range and the oldest times in `state.json` as `state.oldest` has them. The range is of the
+// samples that are about now; if there are none, of all.
+void show_oldest(VehicleState& state);
 
 // The one that a recording shows: its streams, its triggers as events, its warnings as findings.
 VehicleState recorded_state(const Recording& recording);
@@ -65,10 +75,14 @@ class StateCollector {
   static constexpr Duration kWantedTime = std::chrono::seconds(5);
   static constexpr Duration kFindingsPeriod = std::chrono::seconds(10);
   static constexpr std::size_t kMaxEvents = 200;
-  static constexpr int kMaxIncidents = 64;  // of one black box, in one turn
+  static constexpr std::size_t kMaxProbes = 32;  // in one turn; each opens a stream
+  static constexpr int kMaxIncidents = 64;       // of one black box, in one turn
 
   void run();
   Result<void> collect(bool all);
+  // A guess for each stream, and the true time for this PC's, if all is wanted.
+  void find_oldest(bool all);
+  void probe(const StreamInfo& stream);
   void find_events(const std::vector<HostInfo>& hosts);
   void find_incidents(const StreamInfo& stream);
   void add_event(bool is_warning, std::string text);
@@ -87,6 +101,14 @@ class StateCollector {
   std::map<std::string, std::pair<HostState, bool>> hosts_;  // and whether its clock is refused
   std::map<std::string, StreamState> streams_;
   std::map<std::string, Reader<ctl::RecordedIncident>> incidents_;  // of all black boxes
+  // When the oldest sample of a stream is from.
+  struct Probe {
+    std::uint64_t incarnation;
+    Tid oldest;
+    MonoTime at;
+    std::optional<Time> time;  // empty: it could not be read
+  };
+  std::map<std::string, Probe> probes_;  // of streams of this PC
   std::deque<ctl::Json> events_;
   std::uint64_t last_event_ = 0;
 

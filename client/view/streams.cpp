@@ -3,6 +3,7 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
 #include <memory>
 #include <utility>
 
@@ -46,6 +47,24 @@ const TypeInfo& OpenStream::type() const {
 
 void OpenStream::follow_restart() {
   fields = ctl::readable_fields_untrusted(ctl::type_to_show(type(), obvious));
+}
+
+std::optional<Time> oldest_time(const RawReader& reader) {
+  constexpr int kMaxTries = 64;
+  Tid tid = reader.oldest_tid();
+  for (int i = 0; i < kMaxTries; ++i) {
+    SampleInfo info;
+    const ReadStatus status = reader.read_info(tid, info);
+    if (status == ReadStatus::ok) return info.time;
+    if (status == ReadStatus::too_old) {
+      tid = std::max(tid + 1, reader.oldest_tid());  // it was overwritten meanwhile
+    } else if (status == ReadStatus::lost) {
+      ++tid;
+    } else {
+      break;
+    }
+  }
+  return std::nullopt;
 }
 
 Streams::Found Streams::find(const std::string& name) {
@@ -120,6 +139,16 @@ void Streams::ask_property(const std::string& name, std::optional<Time> t, Prope
       for (const PropertyDone& call : all) call(property);
     });
   });
+}
+
+std::optional<Time> Streams::known_oldest(const StreamInfo& stream, const std::string& host) const {
+  const auto found = entries_.find(stream.id.str());
+  if (found == entries_.end() || !found->second.stream) return std::nullopt;
+  const bool has_history = stream.mirror && stream.mirror->history_wanted;
+  if (stream.id.host != host && !has_history) return std::nullopt;
+  const auto* const reader = std::get_if<RawReader>(&found->second.stream->reader);
+  if (!reader || reader->incarnation() != stream.incarnation) return std::nullopt;
+  return oldest_time(*reader);
 }
 
 void Streams::close_unused() {

@@ -49,6 +49,10 @@ ReadStatus past_restarts(Read read) {
   return status;
 }
 
+// The time of the oldest sample that is readable; of a mirror, this fetches the history that is not
+// here.
+std::optional<Time> oldest_time(const RawReader& reader);
+
 class Streams {
  public:
   // `server` outlives it.
@@ -69,6 +73,10 @@ class Streams {
   //          Recording::property()
   using PropertyDone = std::function<void(const Result<std::vector<std::byte>>&)>;
   void ask_property(const std::string& name, std::optional<Time> t, PropertyDone done);
+
+  // The time of the oldest sample of a stream that is open here; nothing for another one, nor for a
+  // mirror for whose history no program has asked. `host`: this PC's.
+  std::optional<Time> known_oldest(const StreamInfo& stream, const std::string& host) const;
 
   // Closes what was not found for long.
   void close_unused();

@@ -18,14 +18,16 @@ const kArrivingMs = 200; // the sample of a held instant is still on its way
 const kUrlMs = 300;
 const kTypeRetryMs = 2000;
 const kStepMs = 100; // where no stream is shown
+const kMaxMarginNs = 1000000000n; // from the oldest sample of a ring that is being written
 const kMaxSteps = 12; // requests for one step
 
 const find = (id) => document.getElementById(id);
 const scheme = location.protocol === "https:" ? "wss" : "ws";
 const connection = new Connection(`${scheme}://${location.host}/`);
-const time = new Time();
+const time = new Time(beginning);
 const kFirstView = "first view"; // a mark for measurements: hosts are shown
 let overview = null; // the last answer
+let overviewAt = 0; // ms, of performance.now(), when it came
 
 // --- types of streams ----------------------------------------------------------------------------
 
@@ -88,6 +90,31 @@ function incarnationOf(stream) {
 
 function streams() {
   return overview?.streams ?? [];
+}
+
+// When the oldest sample of a stream is from that is still there in a moment: a full ring loses its
+// oldest samples while it is written. Null for none.
+function oldestOf(stream) {
+  if (!stream?.oldest_ns) return null;
+  const oldest = BigInt(stream.oldest_ns);
+  if (stream.state !== "live" || stream.oldest_tid === 0) return oldest;
+  const part = (BigInt(stream.newest_ns) - oldest) / 10n;
+  const sinceNs = BigInt(Math.round((performance.now() - overviewAt) * 1e6));
+  return oldest + sinceNs + (part < kMaxMarginNs ? part : kMaxMarginNs);
+}
+
+// The oldest instant at which a stream that is shown has a sample. A recording is shown from its
+// beginning on.
+function beginning() {
+  const { range } = time;
+  let first = null;
+  for (const stream of time.recorded ? [] : streams()) {
+    if (!page()?.chosenStreams().includes(stream.stream)) continue;
+    const oldest = oldestOf(stream);
+    const isInRange = oldest !== null && oldest >= range.oldest && oldest <= range.newest;
+    if (isInRange && (first === null || oldest < first)) first = oldest;
+  }
+  return first ?? range.oldest;
 }
 
 // "host pc2 is down"; empty for a host that answers.
@@ -171,6 +198,7 @@ for (const [i, button] of tabs.entries()) {
 const overviewPump = new Pump(connection, kOverviewMs, async () => {
   const first = overview === null;
   overview = complete(await connection.request("overview"));
+  overviewAt = performance.now();
   const range = overview.range && {
     oldest: BigInt(overview.range.oldest_ns),
     newest: BigInt(overview.range.newest_ns),
@@ -298,9 +326,9 @@ async function neighbour(stream, t, direction) {
   const here = await at(t);
   const known = streams().find((one) => one.stream === stream);
   if (!here) {
-    const end = direction < 0 ? known?.newest_ns : known?.oldest_ns;
-    const isThere = end && (direction < 0 ? BigInt(end) < t : BigInt(end) > t);
-    return isThere ? BigInt(end) : null;
+    const end = direction < 0 ? known?.newest_ns && BigInt(known.newest_ns) : oldestOf(known);
+    const isThere = end && (direction < 0 ? end < t : end > t);
+    return isThere ? end : null;
   }
   if (direction < 0) return (await at(here.ns - 1n))?.ns ?? null;
   // Ahead by a cycle, then by more; and back, should that skip samples.
@@ -457,7 +485,7 @@ const kKeys = {
   " ": () => time.toggle(),
   ArrowLeft: (event) => step(event.shiftKey ? -10 : -1),
   ArrowRight: (event) => step(event.shiftKey ? 10 : 1),
-  Home: () => time.range && time.hold(time.range.oldest),
+  Home: () => time.range && time.hold(beginning()),
   End: () => time.live(),
   r: () => time.play(),
   l: () => time.live(),

@@ -16,8 +16,10 @@ const kRates = [0.1, 0.5, 1, 2, 5, 10, 50];
 
 // Dispatches "change" when the instant to show has changed, and "mode" when the mode has.
 export class Time extends EventTarget {
-  constructor() {
+  // beginning: returns the instant from which on there are samples, if there is a range
+  constructor(beginning) {
     super();
+    this.beginning = beginning;
     this.mode = "live";
     this.t = null; // null while live
     this.hover = null;
@@ -58,7 +60,7 @@ export class Time extends EventTarget {
     const { oldest, newest } = this.range;
     const from = this.t ?? this.shown ?? oldest;
     this.hover = null;
-    this.set("play", from >= newest || from < oldest ? oldest : from);
+    this.set("play", from >= newest || from < oldest ? this.beginning() : from);
     let last = performance.now();
     clearInterval(this.timer);
     this.timer = setInterval(() => {

@@ -296,6 +296,18 @@ def slider(page, *streams):
     say("at", settled(page, streams), *tids())
 
 
+def oldest(page, stream, oldest_ns, second_ns):
+    """Home shows the oldest sample of `stream`, and steps lead on from there."""
+    page.open("views", views=[{"stream": stream}])
+    page.wait("a sample", lambda: page.get(card(stream), "data-tid"))
+    page.wait("what the rings hold", lambda: page.get("#time", "data-oldest-ns") == oldest_ns)
+    for key, t, tid in [(Keys.HOME, oldest_ns, "0"), (Keys.ARROW_RIGHT, second_ns, "1"),
+                        (Keys.ARROW_LEFT, oldest_ns, "0")]:
+        page.press(key)
+        page.wait(f"tid {tid}", lambda: page.get(card(stream), "data-tid") == tid)
+        assert settled(page, [stream]) == t
+
+
 def settled(page, streams):
     """Waits until the views show the held instant; returns it."""
     def held():
@@ -566,7 +578,7 @@ def recording(page, stream, late, oldest_ns, newest_ns):
 
 
 CHECKS = {check.__name__: check for check in
-          [overview, signal, axes, slider, recreated, link, export, save, views, drive, host_down,
+          [overview, signal, axes, slider, oldest, recreated, link, export, save, views, drive, host_down,
            reconnect, phone, recording]}
 
 

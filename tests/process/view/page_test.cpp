@@ -134,6 +134,16 @@ TEST_F(ViewPage, ShowsTheSamplesOfTheSlidersInstantAsDssmctlDoes) {
   EXPECT_EQ(instants, 6);
 }
 
+TEST_F(ViewPage, StepsFromTheOldestSample) {
+  const auto ns = [](std::int64_t i) {  // 1 Hz at first, then 1 kHz
+    return 1000 * kSecond + std::min<std::int64_t>(i, 90) * kSecond +
+           std::max<std::int64_t>(i - 90, 0) * 1'000'000;
+  };
+  auto motion = session_.create<Wheels>("motion", depth_of(201)).value();
+  for (int i = 0; i < 200; ++i) motion.write({}, at_ns(ns(i)));
+  expect_ok("oldest", {kMotion, std::to_string(ns(0)), std::to_string(ns(1))});
+}
+
 TEST_F(ViewPage, KeepsWhatIsChosenInItsUrl) {
   auto motion = session_.create<Wheels>("motion", depth_of(8)).value();
   motion.write({});

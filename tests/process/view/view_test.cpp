@@ -185,6 +185,53 @@ TEST_F(View, ShowsHostsStreamsAndPrograms) {
   EXPECT_EQ((*pc3)["state"], "down") << overview["hosts"];
 }
 
+// Not by its rate: 1 Hz at first, then 1 kHz.
+std::int64_t irregular_ns(std::int64_t i) {
+  return 1000 * kSecond + std::min<std::int64_t>(i, 900) * kSecond +
+         std::max<std::int64_t>(i - 900, 0) * 1'000'000;
+}
+
+TEST_F(View, StatesWhenTheOldestSamplesAreFrom) {
+  auto motion = session_.create<Motion>("motion", depth_of(1201)).value();
+  auto lidar = on_pc2_.create<std::int64_t>("lidar", depth_of(1201)).value();
+  for (std::int64_t i = 0; i < 1200; ++i) {
+    motion.write({}, at_ns(irregular_ns(i)));
+    lidar.write(i, at_ns(irregular_ns(i)));
+  }
+  Json overview;
+  const auto await_streams_in_overview = [&](const auto& is_so) {
+    await([&] {
+      overview = ask({{"op", "overview"}});
+      return overview["streams"].size() == 2 && is_so(overview["streams"]);
+    });
+  };
+  const std::string first = std::to_string(irregular_ns(0));
+  await_streams_in_overview([&](const Json& streams) { return streams[0]["oldest_ns"] == first; });
+  EXPECT_EQ(overview["range"]["oldest_ns"], first);
+  EXPECT_EQ(session_.stream_info(motion.id()).value().readers, 0U);
+  // That of another host is not fetched for this.
+  const auto ask_lidar = [&](const Json& t) {
+    return ask({{"op", "at"}, {"streams", {"lidar:0@pc2"}}, {"t_ns", t}})["samples"][0];
+  };
+  await([&] { return ask_lidar(nullptr)["status"] == "ok"; });
+  await_streams_in_overview([&](const Json& streams) { return !streams[1]["mirror"].is_null(); });
+  const auto second_of = [](const Json& state) {
+    return std::stoll(state["now_ns"].get<std::string>()) / kSecond;
+  };
+  const auto begin = second_of(overview);
+  await_streams_in_overview([&](const Json&) { return second_of(overview) > begin + 2; });
+  const Json& mirror = overview["streams"][1]["mirror"];
+  EXPECT_EQ(mirror["history_wanted"], false) << mirror;
+  EXPECT_NE(overview["streams"][1]["oldest_ns"], first);
+  // As soon as it is here, it counts.
+  await([&] { return ask_lidar(first)["status"] == "ok"; });
+  await_streams_in_overview([&](const Json& streams) { return streams[1]["oldest_ns"] == first; });
+  // A ring that is written goes on.
+  for (std::int64_t i = 1200; i < 1300; ++i) motion.write({}, at_ns(irregular_ns(i)));
+  const std::string later = std::to_string(irregular_ns(100));
+  await_streams_in_overview([&](const Json& streams) { return streams[0]["oldest_ns"] == later; });
+}
+
 // As a black box announces it.
 TEST_F(View, TellsOfRecordedIncidents) {
   ctl::RecordedIncident incident{};
