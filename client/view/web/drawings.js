@@ -347,7 +347,10 @@ export class ImageView {
     if (bytes[0] === 0xff && bytes[1] === 0xd8 && bytes[2] === 0xff)
       return this.showJpeg(bytes, note);
     const size = this.sizeOf(payload, bytes);
-    if (!size) return note("The size of the image is not known");
+    if (!size) {
+      this.empty();
+      return note("The size of the image is not known");
+    }
     const { columns, rows, channels } = size;
     const pixels = new ImageData(columns, rows);
     const out = pixels.data;
@@ -361,6 +364,12 @@ export class ImageView {
     this.canvas.getContext("2d").putImageData(pixels, 0, 0);
     ++this.newest; // a JPEG that is still being decoded is older
     note(`${columns} \u00d7 ${rows}, ${channels === 1 ? "grey" : "RGB"}`);
+  }
+
+  // Also of a JPEG that is still being decoded.
+  empty() {
+    ++this.newest;
+    this.canvas.getContext("2d").clearRect(0, 0, this.canvas.width, this.canvas.height);
   }
 
   // From the sample's fields, else from the number of bytes.
@@ -386,7 +395,11 @@ export class ImageView {
         note(`${bitmap.width} \u00d7 ${bitmap.height}, JPEG`);
         bitmap.close();
       },
-      () => number === this.newest && note("The JPEG image cannot be decoded"),
+      () => {
+        if (number !== this.newest) return;
+        this.empty();
+        note("The JPEG image cannot be decoded");
+      },
     );
   }
 

@@ -14,7 +14,7 @@ const kOverviewMs = 200; // the answer comes when there is a new state, about ea
 const kFailedMs = 1000;
 const kAtMs = 50;
 const kOpeningMs = 100;
-const kArrivingMs = 200; // the sample of a held instant is still on its way
+const kArrivingMs = 200; // the sample of a held instant could not be read yet
 const kUrlMs = 300;
 const kTypeRetryMs = 2000;
 const kStepMs = 100; // where no stream is shown
@@ -252,7 +252,7 @@ const atPump = new Pump(connection, kAtMs, async () => {
   const has = (status) => answer.head.samples.some((one) => one.status === status);
   if (has("opening") || has("restarted")) return kOpeningMs;
   if (time.mode !== "hold" && time.hover === null) return 0;
-  return has("arriving") || has("not_yet") ? kArrivingMs : null;
+  return has("arriving") || has("not_yet") || has("lapped") ? kArrivingMs : null;
 });
 time.addEventListener("change", () => atPump.wake());
 

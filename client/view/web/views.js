@@ -16,6 +16,10 @@ const kOpeningMs = 100;
 const kTrailPoints = 2000;
 const kTrailSpans = [0, 10, 30, 60, 300, 3600]; // seconds
 const kDefaultTrail = 60;
+// A sample with these states may be here in a moment: then the drawing stays so long, and does not
+// flicker.
+const kPassing = new Set(["opening", "arriving", "restarted", "lapped"]);
+const kPassingMs = 300;
 
 // Dispatches "change" when what is chosen has changed.
 export class Views extends EventTarget {
@@ -154,6 +158,7 @@ class Card {
     this.trail = null;
     this.propertyAt = -Infinity; // when it was asked for
     this.drawing = null;
+    this.drawnAt = -Infinity; // ms, of performance.now(), when it showed its last sample
     this.make();
   }
 
@@ -201,6 +206,7 @@ class Card {
     }
     this.trailLabel = element("label", { hidden: true }, "trail ", this.trailBox);
     this.body = element("div", { class: "drawing" });
+    this.absence = element("p", { class: "absence", role: "status" });
     this.note = element("p", { class: "status", role: "status" });
     this.foot = {};
     for (const key of ["tid", "time", "age", "error", "stale"])
@@ -233,7 +239,7 @@ class Card {
           "\u00d7",
         ),
       ),
-      this.body,
+      element("div", { class: "stage" }, this.body, this.absence),
       this.note,
       element("footer", {}, ...Object.values(this.foot)),
     );
@@ -354,7 +360,12 @@ class Card {
     this.element.dataset.status = sample.status;
     this.element.dataset.stale = sample.staleness;
     this.showFoot(t, sample);
-    if (!sample.payload) return;
+    if (!sample.payload) {
+      this.showAbsence(sample);
+      return;
+    }
+    this.drawnAt = performance.now();
+    this.setAbsence("");
     // What a JPEG is, its type need not say.
     const isJpeg =
       !this.isJpeg &&
@@ -372,8 +383,26 @@ class Card {
     try {
       this.draw(sample, samples);
     } catch (error) {
-      setText(this.note, `This view does not fit the sample: ${error.message}`);
+      this.setAbsence(`This view does not fit the sample: ${error.message}`);
+      setText(this.note, "");
     }
+  }
+
+  // Instead of the sample of another instant.
+  showAbsence(sample) {
+    const isPassing = kPassing.has(sample.status) && performance.now() - this.drawnAt < kPassingMs;
+    if (isPassing) return;
+    const text = sample.error || sample.text;
+    // A stream without samples may have a property.
+    const isProperty = this.shownKind() === "property";
+    this.setAbsence(isProperty ? "" : text);
+    setText(this.note, isProperty ? text : "");
+  }
+
+  setAbsence(text) {
+    setText(this.absence, text);
+    if (text !== "" && !this.body.inert) this.drawing?.empty?.();
+    this.body.inert = text !== "";
   }
 
   draw(sample, samples) {
@@ -407,8 +436,6 @@ class Card {
     const { foot } = this;
     this.element.dataset.tid = sample.tid ?? "";
     this.element.dataset.timeNs = sample.timeNs === null ? "" : String(sample.timeNs);
-    const none = sample.status !== "ok" && !sample.payload;
-    if (none) setText(this.note, sample.error || sample.text);
     setText(foot.stale, sample.staleness);
     setText(foot.tid, sample.tid === null ? "" : `tid ${sample.tid}`);
     setText(foot.time, sample.timeNs === null ? "" : timeOfDay(sample.timeNs));

@@ -308,6 +308,42 @@ def oldest(page, stream, oldest_ns, second_ns):
         assert settled(page, [stream]) == t
 
 
+def absent(page, early, late, image):
+    """At an instant where a stream has no sample, its view is empty and says why."""
+    page.may_report = ["willReadFrequently"]  # this check reads pixels
+    page.open("views", views=[{"stream": early}, {"stream": late}, {"stream": image},
+                              {"stream": "nothing:0@pc1"}])
+    pixel = "return [...arguments[0].getContext('2d').getImageData(40, 30, 1, 1).data]"
+
+    def shown(stream):
+        """Whether the drawing is seen; what is seen instead of it."""
+        text = page.one(f"{card(stream)} .absence").text
+        return page.one(f"{card(stream)} .drawing").is_displayed(), text
+
+    def pixel_of(stream):
+        return page.run(pixel, page.one(card(stream) + " canvas"))
+
+    def await_all():
+        for stream in [early, late, image]:
+            page.wait(f"{stream} is shown", lambda: page.get(card(stream), "data-tid")
+                      and shown(stream) == (True, ""))
+        page.wait("the image", lambda: pixel_of(image) == [70, 70, 70, 255])
+
+    await_all()
+    page.wait("what is wrong", lambda: "nothing" in shown("nothing:0@pc1")[1])
+    page.press(Keys.HOME)
+    settled(page, [early])
+    for stream in [late, image]:
+        page.wait(f"no sample of {stream}",
+                  lambda: shown(stream) == (False, "the ring begins 500 ms later"))
+        assert page.one(card(stream)).text.count("500 ms later") == 1
+    assert shown(early) == (True, "")
+    assert pixel_of(image) == [0, 0, 0, 0], "the canvas still has the image of another instant"
+    page.shot("absent")
+    page.press("l")
+    await_all()
+
+
 def settled(page, streams):
     """Waits until the views show the held instant; returns it."""
     def held():
@@ -578,7 +614,7 @@ def recording(page, stream, late, oldest_ns, newest_ns):
 
 
 CHECKS = {check.__name__: check for check in
-          [overview, signal, axes, slider, oldest, recreated, link, export, save, views, drive, host_down,
+          [overview, signal, axes, slider, oldest, absent, recreated, link, export, save, views, drive, host_down,
            reconnect, phone, recording]}
 
 

@@ -177,6 +177,22 @@ TEST_F(ViewPage, DrawsScansPosesImagesAndBytes) {
   expect_ok("views", {"scan:0@pc1", "pose:0@pc1", "camera:0@pc1", "raw:0@pc1"});
 }
 
+TEST_F(ViewPage, EmptiesViewsWithoutASampleAtTheInstant) {
+  auto early = session_.create<Wheels>("early", depth_of(8)).value();
+  auto late = session_.create<Wheels>("late", depth_of(8)).value();
+  std::vector<std::byte> grey(160 * 120, std::byte{70});
+  auto image =
+      session_.create_raw({"camera", 0, ""}, TypeInfo{"", grey.size(), 1, {}}, depth_of(8)).value();
+  for (const std::int64_t ms : {0, 500, 1000}) {
+    const Time time = at_ns(1000 * kSecond + ms * 1'000'000);
+    early.write({}, time);
+    if (ms == 0) continue;
+    late.write({}, time);
+    image.write(grey, time);
+  }
+  expect_ok("absent", {"early:0@pc1", "late:0@pc1", "camera:0@pc1"});
+}
+
 TEST_F(ViewPage, ShowsTheFieldsOfAStreamThatIsCreatedAgain) {
   auto wheels = std::optional(session_.create<Wheels>("thing", depth_of(8)).value());
   wheels->write({});
