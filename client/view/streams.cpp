@@ -2,6 +2,7 @@
 #include "client/view/streams.hpp"
 
 #include <fmt/format.h>
+#include <unistd.h>
 
 #include <algorithm>
 #include <memory>
@@ -13,6 +14,16 @@
 
 namespace dssm::view {
 namespace {
+
+// The programs that have it open, apart from this one, as a key to see whether they change.
+std::string users_of(const StreamInfo& stream) {
+  std::string users;
+  for (const StreamUser& user : stream.users) {
+    if (user.pid == ::getpid()) continue;
+    users += fmt::format("{} {} {} {}\n", user.host, user.pid, int(user.role), user.program);
+  }
+  return users;
+}
 
 Result<std::vector<std::byte>> recorded_property(const Recording& recording, const StreamId& id,
                                                  std::optional<Time> t) {
@@ -36,9 +47,10 @@ Result<std::vector<std::byte>> recorded_property(const Recording& recording, con
 
 }  // namespace
 
-OpenStream::OpenStream(StreamReader opened, TypeInfo program_type)
-    : reader(std::move(opened)), obvious(std::move(program_type)) {
-  follow_restart();
+OpenStream::OpenStream(StreamReader opened) : reader(std::move(opened)) { follow_restart(); }
+
+bool OpenStream::is_undescribed() const {
+  return std::holds_alternative<RawReader>(reader) && type().fields.empty();
 }
 
 const TypeInfo& OpenStream::type() const {
@@ -81,7 +93,10 @@ Streams::Found Streams::find(const std::string& name) {
   if (entry.stream) {
     const auto* const live = std::get_if<RawReader>(&entry.stream->reader);
     const std::optional<Error> error = live ? live->restart_error() : std::nullopt;
-    if (!error) return {&*entry.stream, {}};
+    if (!error) {
+      if (entry.stream->is_undescribed()) describe(name, entry);
+      return {&*entry.stream, {}};
+    }
     entry.error = error->message;  // it cannot go on
     entry.stream.reset();
   }
@@ -94,14 +109,20 @@ void Streams::open(const std::string& name) {
   entry.is_opening = true;
   entry.retry_at = deadline_in(kRetryPeriod);
   const auto result = std::make_shared<Result<OpenStream>>(Error{Errc::unavailable, {}});
-  worker_.add([this, name, result] {
-    *result = open_in_source(*StreamId::parse(name));  // find() has tried that
-    server_.post([this, name, result] {
+  const auto description = std::make_shared<Description>(descriptions_[name]);
+  worker_.add([this, name, result, description] {
+    const StreamId id = *StreamId::parse(name);  // find() has tried that
+    *result = open_in_source(id);
+    if (*result && (*result)->is_undescribed()) {
+      *description = find_description(id, std::move(*description));
+    }
+    server_.post([this, name, result, description] {
       Entry& opened = entries_[name];
       opened.is_opening = false;
       if (*result) {
         opened.error.clear();
         opened.stream.emplace(*std::move(*result));
+        use(name, *description);
       } else {
         opened.error = result->error().message;
       }
@@ -110,12 +131,48 @@ void Streams::open(const std::string& name) {
 }
 
 Result<OpenStream> Streams::open_in_source(const StreamId& id) {
-  auto* const session = std::get_if<Session>(&source_);
-  if (!session) return OpenStream(DSSM_TRY(std::get<Recording>(source_).open_raw_reader(id)));
-  RawReader reader = DSSM_TRY(session->open_raw_reader(id));
-  std::optional<ctl::ProgramType> program;
-  if (reader.type().fields.empty()) program = ctl::obvious_type_of_programs(*session, reader.id());
-  return OpenStream(std::move(reader), program ? std::move(program->found.type) : TypeInfo());
+  if (auto* const session = std::get_if<Session>(&source_)) {
+    return OpenStream(DSSM_TRY(session->open_raw_reader(id)));
+  }
+  return OpenStream(DSSM_TRY(std::get<Recording>(source_).open_raw_reader(id)));
+}
+
+void Streams::describe(const std::string& name, Entry& entry) {
+  const MonoTime now = MonoClock::now();
+  if (entry.is_describing || now < entry.describe_at) return;
+  entry.is_describing = true;
+  worker_.add([this, name, id = *StreamId::parse(name), known = descriptions_[name]] {
+    server_.post([this, name, description = find_description(id, known)] {
+      entries_[name].is_describing = false;
+      use(name, description);
+    });
+  });
+}
+
+void Streams::use(const std::string& name, const Description& description) {
+  Entry& entry = entries_[name];
+  entry.describe_at = deadline_in(kDescribePeriod);
+  descriptions_[name] = description;
+  if (!entry.stream || !entry.stream->is_undescribed()) return;
+  if (std::get<RawReader>(entry.stream->reader).incarnation() != description.incarnation) return;
+  entry.stream->obvious = description.type;
+  entry.stream->follow_restart();
+}
+
+Streams::Description Streams::find_description(const StreamId& id, Description known) {
+  auto& session = std::get<Session>(source_);
+  const Result<StreamInfo> stream = session.stream_info(id);
+  if (!stream) return known;
+  Description now{stream->incarnation, users_of(*stream), {}};
+  if (!stream->type.fields.empty()) {
+    now.type = stream->type;  // by `dssmctl describe`
+  } else if (known.incarnation == now.incarnation &&
+             (!known.type.fields.empty() || known.users == now.users)) {
+    now.type = std::move(known.type);
+  } else if (auto program = ctl::obvious_type_of_programs(session, id)) {
+    now.type = std::move(program->found.type);
+  }
+  return now;
 }
 
 void Streams::ask_property(const std::string& name, std::optional<Time> t, PropertyDone done) {
@@ -154,7 +211,13 @@ std::optional<Time> Streams::known_oldest(const StreamInfo& stream, const std::s
 void Streams::close_unused() {
   const MonoTime now = MonoClock::now();
   std::erase_if(entries_, [&](const auto& named) {
-    return !named.second.is_opening && now - named.second.used > kUnusedTime;
+    const Entry& entry = named.second;
+    return !entry.is_opening && !entry.is_describing && now - entry.used > kUnusedTime;
+  });
+  // The fields that were found remain known, also when no program has the stream open then.
+  std::erase_if(descriptions_, [&](const auto& named) {
+    const bool is_worth = !named.second.type.fields.empty() && descriptions_.size() <= kMaxStreams;
+    return !entries_.contains(named.first) && !is_worth;
   });
 }
 

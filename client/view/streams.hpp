@@ -27,16 +27,17 @@ using StreamReader = std::variant<RawReader, RecordedRawReader>;  // of a stream
 
 // A stream that is open.
 struct OpenStream {
-  //   program_type  of the programs that have it open, if it is not described
-  explicit OpenStream(StreamReader opened, TypeInfo program_type = {});
+  explicit OpenStream(StreamReader opened);
 
+  // Whether its own type has no fields, which may be known otherwise: live streams only.
+  bool is_undescribed() const;
   // To be called when a read returned `restarted`: type and fields may be others now.
   void follow_restart();
 
   const TypeInfo& type() const;
 
   StreamReader reader;
-  TypeInfo obvious;
+  TypeInfo obvious;  // of the programs that have it open, or given by `dssmctl describe` since
   std::vector<Field> fields;  // readable ones; empty: its payload is not described
 };
 
@@ -87,19 +88,35 @@ class Streams {
   static constexpr std::size_t kMaxStreams = 4096;   // that were asked for lately
   static constexpr std::size_t kMaxProperties = 64;  // that are asked for
 
+  static constexpr Duration kDescribePeriod = std::chrono::seconds(2);
+
   struct Entry {
     std::optional<OpenStream> stream;
     std::string error;
     bool is_opening = false;
     MonoTime retry_at{};
     MonoTime used{};
+    bool is_describing = false;
+    MonoTime describe_at{};
+  };
+  // What is known of a stream whose own type has no fields.
+  struct Description {
+    std::uint64_t incarnation = 0;
+    std::string users;  // the programs that had it open when these were asked
+    TypeInfo type;      // with fields, if they are known; then for all of the incarnation
   };
   void open(const std::string& name);
-  Result<OpenStream> open_in_source(const StreamId& id);  // the worker's
+  // Asks again, now and then, for the fields of a stream that has none.
+  void describe(const std::string& name, Entry& entry);
+  void use(const std::string& name, const Description& description);
+  // The worker's.
+  Result<OpenStream> open_in_source(const StreamId& id);
+  Description find_description(const StreamId& id, Description known);
 
   Source source_;
   Server& server_;
   std::map<std::string, Entry> entries_;
+  std::map<std::string, Description> descriptions_;
   // Those who wait for a property, by its stream and time.
   std::map<std::pair<std::string, std::optional<Time>>, std::vector<PropertyDone>> properties_;
   Worker worker_;

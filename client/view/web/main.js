@@ -34,7 +34,7 @@ let overviewAt = 0; // ms, of performance.now(), when it came
 // The types that were asked for. A recreated stream may have another one.
 class Types {
   constructor() {
-    this.known = new Map(); // stream -> {type, incarnation, failedAt, promise}
+    this.known = new Map(); // stream -> {type, incarnation, askedAt, failedAt, promise}
   }
 
   get(stream) {
@@ -46,17 +46,18 @@ class Types {
     const entry = this.known.get(stream);
     if (entry && (entry.type || performance.now() - entry.failedAt < kTypeRetryMs))
       return entry.promise;
-    const made = { type: null, failedAt: Infinity, incarnation: incarnationOf(stream) };
+    const made = {
+      type: null,
+      askedAt: performance.now(),
+      failedAt: Infinity,
+      incarnation: incarnationOf(stream),
+    };
     this.known.set(stream, made);
     made.promise = this.request(stream).then(
       (answer) => {
         // Not the overview's, which may be older or newer.
         made.incarnation = answer.incarnation ?? made.incarnation;
-        made.type = {
-          fields: answer.fields ?? [],
-          payload_bytes: answer.payload_bytes,
-          name: answer.name,
-        };
+        made.type = typeOf(answer);
         return made.type;
       },
       (error) => {
@@ -76,12 +77,38 @@ class Types {
     }
   }
 
+  // Asks again for the fields of those of these streams that have none: `dssmctl describe` may give
+  // them some, or a program that opens the stream.
+  async askAgain(streams) {
+    const now = performance.now();
+    const isDue = ({ type, askedAt }) =>
+      !time.recorded && type?.fields.length === 0 && now - askedAt > kTypeRetryMs;
+    const entries = streams.map((stream) => [stream, this.known.get(stream)]);
+    const asked = entries.map(async ([stream, entry]) => {
+      if (!entry || !isDue(entry)) return;
+      entry.askedAt = now;
+      const type = typeOf(await this.request(stream));
+      if (type.fields.length === 0) return;
+      entry.type = type;
+      entry.promise = Promise.resolve(type);
+    });
+    try {
+      await Promise.all(asked);
+    } catch (error) {
+      if (!(error instanceof RequestError || error instanceof LostError)) throw error;
+    }
+  }
+
   forgetRecreated() {
     for (const [stream, { incarnation }] of this.known) {
       const now = incarnationOf(stream);
       if (now !== null && now !== incarnation) this.known.delete(stream);
     }
   }
+}
+
+function typeOf({ fields, payload_bytes, name }) {
+  return { fields: fields ?? [], payload_bytes, name };
 }
 
 function incarnationOf(stream) {
@@ -205,6 +232,7 @@ const overviewPump = new Pump(connection, kOverviewMs, async () => {
   };
   time.setRange(range, Boolean(overview.recording));
   types.forgetRecreated();
+  types.askAgain(page()?.chosenStreams() ?? []);
   setText(find("host"), overview.host);
   find("host").title = `dssm-view ${overview.version}`;
   document.title = `${overview.host} \u2013 DSSM view`;

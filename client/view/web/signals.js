@@ -796,9 +796,10 @@ class Picker {
     this.list.replaceChildren();
     if (!this.dialog.open) this.dialog.showModal();
     this.filter.focus();
-    await Promise.all(
-      this.signals.streams().map((stream) => this.signals.types.ask(stream.stream)),
-    );
+    const { types } = this.signals;
+    const streams = this.signals.streams().map((stream) => stream.stream);
+    await Promise.all(streams.map((stream) => types.ask(stream)));
+    await types.askAgain(streams);
     this.show();
   }
 

@@ -344,6 +344,25 @@ def absent(page, early, late, image):
     await_all()
 
 
+def described_later(page, stream, later, field):
+    """The views of streams without fields get them while they are open: those of `stream` when the
+    program that writes to it is there, and they remain without it; of `later`, when they are
+    described."""
+    page.open("views", views=[{"stream": stream}, {"stream": later}])
+    for name in [stream, later]:
+        page.wait("bytes", lambda: page.get(card(name), "data-kind") == "hex")
+    say("hex")
+    page.wait("the field", lambda: field in page.one(card(stream)).text)
+    assert page.get(card(later), "data-kind") == "hex"
+    say("of the program")
+    page.wait("the other field", lambda: "watts" in page.one(card(later)).text)
+    page.open("overview")
+    page.wait("the program's end", lambda: page.get(stream_row(stream), "data-state") in
+              ["no writer", "stalled"] and "state_writer" not in page.one("#streams").text)
+    page.open("views", views=[{"stream": stream}])
+    page.wait("the field is there still", lambda: field in page.one(card(stream)).text)
+
+
 def settled(page, streams):
     """Waits until the views show the held instant; returns it."""
     def held():
@@ -614,7 +633,7 @@ def recording(page, stream, late, oldest_ns, newest_ns):
 
 
 CHECKS = {check.__name__: check for check in
-          [overview, signal, axes, slider, oldest, absent, recreated, link, export, save, views, drive, host_down,
+          [overview, signal, axes, slider, oldest, absent, described_later, recreated, link, export, save, views, drive, host_down,
            reconnect, phone, recording]}
 
 

@@ -193,6 +193,24 @@ TEST_F(ViewPage, EmptiesViewsWithoutASampleAtTheInstant) {
   expect_ok("absent", {"early:0@pc1", "late:0@pc1", "camera:0@pc1"});
 }
 
+TEST_F(ViewPage, ShowsFieldsThatAreKnownLater) {
+  const StreamId wheel{"wheel_state", 0, ""}, lamp{"lamp", 0, ""};
+  const std::vector<std::byte> bytes(16);
+  for (const StreamId& id : {wheel, lamp}) {
+    const char* const type = id == wheel ? "WheelState" : "";
+    session_.create_raw(id, TypeInfo{type, bytes.size(), 8, {}}, depth_of(8)).value().write(bytes);
+  }
+  Running page(page_argv("described_later", {"wheel_state:0@pc1", "lamp:0@pc1", "travel_m"}), {});
+  ASSERT_EQ(page.line(), "hex") << page.rest();
+  {
+    Running program({built("tests/process/view/state_writer")}, {daemon_.environment()});
+    ASSERT_EQ(page.line(), "of the program") << page.rest();
+  }
+  output({"describe", "lamp", "--from", built("tests/process/view/state_writer"), "--type",
+          "LampState"});
+  lines(page, [] {});
+}
+
 TEST_F(ViewPage, ShowsTheFieldsOfAStreamThatIsCreatedAgain) {
   auto wheels = std::optional(session_.create<Wheels>("thing", depth_of(8)).value());
   wheels->write({});
