@@ -341,7 +341,14 @@ void StateCollector::find_events(const std::vector<HostInfo>& hosts) {
     }
   }
   for (const auto& [name, state] : streams_) {
-    if (!new_streams.contains(name)) add_event(false, fmt::format("stream {} is gone", name));
+    if (new_streams.contains(name)) continue;
+    // The streams of a host that is down are not listed, but may be there still.
+    const auto host = hosts_.find(StreamId::parse(name)->host);
+    if (host != hosts_.end() && !ctl::is_up(host->second.first)) {
+      new_streams[name] = state;
+    } else {
+      add_event(false, fmt::format("stream {} is gone", name));
+    }
   }
   streams_ = std::move(new_streams);
 }

@@ -18,9 +18,10 @@ const kNarrowMaxText = 12;
 const kBackBend = 22; // of an arrow to an earlier layer, which passes beside the boxes
 const kWay = 12; // what a long arrow takes up in the layers that it passes
 
-// nodes: of `overview`; width: the place for the drawing, in CSS pixels.
-export function drawGraph(streams, nodes, width) {
-  const boxes = boxesOf(streams, nodes);
+// nodes: of `overview`; outages: host -> state of those that are not up; width: the place for the
+// drawing, in CSS pixels.
+export function drawGraph(streams, nodes, outages, width) {
+  const boxes = boxesOf(streams, nodes, outages);
   const down = width < kNarrow;
   const shape = {
     down,
@@ -57,9 +58,10 @@ export function drawGraph(streams, nodes, width) {
 }
 
 // key -> {kind, title, host, level, to: keys, from: keys}
-function boxesOf(streams, nodes) {
+function boxesOf(streams, nodes, outages) {
   const boxes = new Map();
-  const add = (key, kind, title, host, level) => {
+  const add = (key, kind, title, host, state) => {
+    const level = outages.has(host) ? `host ${outages.get(host)}` : state;
     if (!boxes.has(key))
       boxes.set(key, { key, kind, title, host, level, to: new Set(), from: new Set() });
     return boxes.get(key);

@@ -28,6 +28,7 @@ export class Overview {
     setText(this.find("no-events"), recorded ? "The recorder waited for no event." : kNoEvents);
     this.showHosts(answer.hosts, limitNs);
     this.showStreams(answer.streams, answer.nodes);
+    this.showUnlisted(answer);
     this.showFindings(answer.findings);
     this.showEvents(answer.events);
     this.drawGraph();
@@ -64,7 +65,6 @@ export class Overview {
 
   showStreams(streams, nodes) {
     setText(this.find("streams-count"), String(streams.length));
-    this.find("no-streams").hidden = streams.length > 0;
     this.find("streams").hidden = streams.length === 0;
     const users = usersOf(nodes);
     const key = (stream) => stream.stream;
@@ -88,6 +88,17 @@ export class Overview {
       showUsers(writers, used.writers, sum(stream.writers, stream.remote_writers));
       showUsers(readers, used.readers, sum(stream.readers, stream.remote_readers));
     });
+  }
+
+  // Why there may be more streams than those that are listed.
+  showUnlisted({ streams, hosts }) {
+    const texts = hosts
+      .filter((host) => host.host && !isUp(host))
+      .map(({ host, state }) => `Host ${host} is ${state}: its streams are not listed.`);
+    if (streams.length === 0) texts.unshift("No stream is known.");
+    const note = this.find("no-streams");
+    note.hidden = texts.length === 0;
+    setText(note, texts.join(" "));
   }
 
   makeStream(stream) {
@@ -178,7 +189,7 @@ export class Overview {
   drawGraph() {
     if (!this.answer || this.root.hidden) return;
     const box = this.find("graph");
-    const { streams, nodes } = this.answer;
+    const { streams, nodes, hosts } = this.answer;
     const inGraph = {
       width: box.clientWidth,
       streams: streams.map((stream) => [
@@ -189,13 +200,15 @@ export class Overview {
         stream.state,
       ]),
       nodes: nodes.filter((node) => node.program !== null || node.pid !== null),
+      outages: hosts.filter((host) => !isUp(host)).map(({ host, state }) => [host, state]),
     };
     const text = JSON.stringify(inGraph);
     if (text === this.graphText) return;
     this.graphText = text;
     const isEmpty = streams.length + inGraph.nodes.length === 0 || this.answer.recording;
     this.root.querySelector("#graph-group").hidden = Boolean(isEmpty);
-    box.replaceChildren(drawGraph(streams, inGraph.nodes, box.clientWidth));
+    const outages = new Map(inGraph.outages);
+    box.replaceChildren(drawGraph(streams, inGraph.nodes, outages, box.clientWidth));
   }
 }
 
@@ -210,8 +223,10 @@ function makeHost() {
   return row;
 }
 
+const isUp = ({ state }) => state === "self" || state === "up";
+
 function hostLevel(state) {
-  if (state === "self" || state === "up") return "ok";
+  if (isUp({ state })) return "ok";
   return state === "down" || state === "refused" ? "fail" : "warn";
 }
 

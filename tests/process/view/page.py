@@ -557,6 +557,12 @@ def host_down(page, host, stream):
     row = f"#hosts tr[data-host='{host}']"
     page.wait("down", lambda: page.get(row, "data-state") == "down")
     page.wait("the event", lambda: f"host {host} is down" in page.one("#events").text)
+    page.wait("why there is no stream", lambda: page.one("#no-streams").text ==
+              f"No stream is known. Host {host} is down: its streams are not listed.")
+    page.wait("it in the graph", lambda: any(
+        title.get_attribute("textContent").endswith(f" on {host}, host down")
+        for title in page.all("#graph .stream title")))
+    assert f"{stream} is gone" not in page.one("#events").text, page.one("#events").text
     page.shot("host-down")
 
 
