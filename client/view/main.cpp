@@ -70,6 +70,11 @@ Result<void> split_listen(Options& options) {
     return wrong(
         fmt::format("--listen '{}' is not ADDRESS:PORT, as 127.0.0.1:8765", ctl::escaped(text)));
   }
+  if (!is_address(address)) {
+    return wrong(fmt::format(
+        "--listen {}: '{}' is not a numeric address of this PC, as 127.0.0.1:8765 or [::1]:8765",
+        ctl::escaped(text), ctl::escaped(address)));
+  }
   options.server.address = address;
   options.server.port = static_cast<std::uint16_t>(*port);
   const bool is_loopback = address.starts_with("127.") || address == "::1";
@@ -78,6 +83,46 @@ Result<void> split_listen(Options& options) {
         "with --listen {} other PCs could read all streams: give --certificate, --key and "
         "--authority, or --insecure if all who reach that address may read them",
         ctl::escaped(text)));
+  }
+  return {};
+}
+
+constexpr std::string_view kLowerCase = "abcdefghijklmnopqrstuvwxyz";
+constexpr std::string_view kDigits = "0123456789";
+constexpr std::string_view kUpperCase = "ABCDEFGHIJKLMNOPQRSTUVWXYZ";
+
+// Names and origins that a browser would never send.
+Result<void> check_names(const ServerOptions& server) {
+  const auto has_only = [](std::string_view text, std::initializer_list<std::string_view> sets) {
+    return !text.empty() && std::ranges::all_of(text, [&](char c) {
+      return std::ranges::any_of(
+          sets, [&](std::string_view set) { return set.find(c) != std::string_view::npos; });
+    });
+  };
+  for (const std::string& host : server.hosts) {
+    if (!has_only(host, {kLowerCase, kUpperCase, kDigits, "-_."})) {
+      return wrong(
+          fmt::format("--host '{}' is not a name, as robot.example.org: without scheme "
+                      "and port",
+                      ctl::escaped(host)));
+    }
+  }
+  for (const std::string& origin : server.origins) {
+    const std::size_t colon = origin.find("://");
+    const std::string scheme = origin.substr(0, colon);
+    const std::string rest = colon == std::string::npos ? "" : origin.substr(colon + 3);
+    const bool has_usual_port = (scheme == "http" && rest.ends_with(":80")) ||
+                                (scheme == "https" && rest.ends_with(":443"));
+    const bool is_server = has_only(scheme, {kLowerCase, kDigits, "+-."}) && !has_usual_port &&
+                           has_only(rest, {kLowerCase, kDigits, "-_.:[]"});
+    // What the pages of a browser's files send.
+    if (!is_server && origin != "null" && origin != "file://") {
+      return wrong(
+          fmt::format("--origin '{}' is not what browsers send, as "
+                      "https://app.foxglove.dev or http://robot:8080: scheme and server "
+                      "in small letters, a port unless it is the usual one, no path",
+                      ctl::escaped(origin)));
+    }
   }
   return {};
 }
@@ -94,6 +139,7 @@ Result<Source> open_source(const Options& options) {
 
 Result<void> serve(Options options) {
   DSSM_TRY(split_listen(options));
+  DSSM_TRY(check_names(options.server));
   Source source = DSSM_TRY(open_source(options));
   auto* const session = std::get_if<Session>(&source);  // none: a recording is shown
   std::optional<VehicleState> recorded;
@@ -222,6 +268,7 @@ int main_program(int argc, char** argv) {
       ->type_name("FOLDER")
       ->envname("DSSM_VIEW_PAGES");
   std::string config;
+  bool is_configured = false;  // what is parsed is from the file, too
   app.add_option("--config", config,
                  "A TOML file with options as keys, before those of the command line")
       ->type_name("FILE");
@@ -234,9 +281,15 @@ int main_program(int argc, char** argv) {
       words.insert(words.begin(), configured->begin(), configured->end());
       std::ranges::reverse(words);  // as CLI11 takes them
       app.clear();
+      is_configured = true;
       app.parse(std::move(words));
     }
   } catch (const CLI::ParseError& error) {
+    // The command line alone was right.
+    if (is_configured && error.get_exit_code() != 0) {
+      return report(wrong(
+          fmt::format("configuration '{}', whose keys are options: {}", config, error.what())));
+    }
     return app.exit(error) == 0 ? kSuccess : kWrongUsage;
   }
   if (server.certificate.empty() != server.key.empty() ||

@@ -54,12 +54,6 @@ std::string_view without_port(std::string_view host) {
   return host.substr(0, host.find(':'));
 }
 
-bool is_address(const std::string& text) {
-  std::array<unsigned char, sizeof(in6_addr)> ignored{};
-  return ::inet_pton(AF_INET, text.c_str(), ignored.data()) == 1 ||
-         ::inet_pton(AF_INET6, text.c_str(), ignored.data()) == 1;
-}
-
 std::string lower_case(std::string text) {
   for (char& c : text) {
     if (c >= 'A' && c <= 'Z') c = static_cast<char>(c - 'A' + 'a');
@@ -104,6 +98,12 @@ bool listens_only_at(const std::string& address, int port) {
 }
 
 }  // namespace
+
+bool is_address(const std::string& text) {
+  std::array<unsigned char, sizeof(in6_addr)> ignored{};
+  return ::inet_pton(AF_INET, text.c_str(), ignored.data()) == 1 ||
+         ::inet_pton(AF_INET6, text.c_str(), ignored.data()) == 1;
+}
 
 // --- messages and peers
 
@@ -587,8 +587,10 @@ bool Server::on_http(lws* connection, int reason, std::uint64_t& request) {
 bool Server::begin_text(lws* connection, std::uint64_t& request, const std::string& path) {
   const auto text = texts_.find(path);
   if (text == texts_.end()) {
-    lws_return_http_status(connection, HTTP_STATUS_NOT_FOUND, nullptr);
-    return lws_http_transaction_completed(connection) == 0;
+    request = ++last_request_;
+    requests_.emplace(request, Request{connection, path, true, nothing_at(path)});
+    lws_callback_on_writable(connection);
+    return true;
   }
   lws_set_timeout(connection, NO_PENDING_TIMEOUT, 0);  // dssmd may need longer than lws waits
   // One that is being made is for all who wait.
@@ -610,14 +612,24 @@ bool Server::begin_text(lws* connection, std::uint64_t& request, const std::stri
   return true;
 }
 
+Error Server::nothing_at(const std::string& path) const {
+  std::string others;
+  for (const auto& [other, text] : texts_) others += fmt::format(", and {}", other);
+  return {Errc::not_found,
+          fmt::format("there is nothing at {}; the page is at /{}\n", ctl::escaped(path), others)};
+}
+
 bool Server::write_text(lws* connection, Request& request) {
   const bool is_made = request.text.has_value();
   const std::string& text = is_made ? *request.text : request.text.error().message;
+  const unsigned status = is_made                         ? HTTP_STATUS_OK
+                          : texts_.contains(request.path) ? HTTP_STATUS_SERVICE_UNAVAILABLE
+                                                          : HTTP_STATUS_NOT_FOUND;
   std::array<unsigned char, LWS_PRE + 2048> head{};
   unsigned char* at = head.data() + LWS_PRE;
   unsigned char* const end = head.data() + head.size() - 1;
   if (lws_add_http_common_headers(
-          connection, is_made ? HTTP_STATUS_OK : HTTP_STATUS_SERVICE_UNAVAILABLE,
+          connection, status,
           is_made ? texts_.at(request.path).content_type.c_str() : "text/plain; charset=utf-8",
           text.size(), &at, end) != 0 ||
       lws_finalize_write_http_header(connection, head.data() + LWS_PRE, &at, end) != 0) {

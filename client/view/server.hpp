@@ -33,6 +33,9 @@ struct lws_context;
 
 namespace dssm::view {
 
+// Whether that is a numeric address, without brackets: 127.0.0.1, ::1.
+bool is_address(const std::string& text);
+
 // A message of a WebSocket; copies share its bytes.
 class Message {
  public:
@@ -162,6 +165,8 @@ class Server {
   bool on_http(lws* connection, int reason, std::uint64_t& request);
   bool on_websocket(lws* connection, int reason, WebSocket*& socket, void* in, std::size_t length);
   bool begin_text(lws* connection, std::uint64_t& request, const std::string& path);
+  // What a client gets that asks for something else than what is here.
+  Error nothing_at(const std::string& path) const;
   bool write_text(lws* connection, Request& request);
   static bool write_message(WebSocket& socket);
   // Why a client's request is refused, for people; empty: it is not.

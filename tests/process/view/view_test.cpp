@@ -59,7 +59,12 @@ TEST_F(View, ServesItsPageAndTheMetrics) {
   EXPECT_TRUE(contains(metrics.second, "application/openmetrics-text")) << metrics.second;
   EXPECT_TRUE(contains(metrics.second, "dssm_host_up{host=\"pc2\"} 1\n")) << metrics.second;
   EXPECT_TRUE(contains(metrics.second, "# EOF\n")) << metrics.second;
-  EXPECT_EQ(get("/nothing").first, 404);
+  const auto nothing = get("/nothing");
+  EXPECT_EQ(nothing.first, 404);
+  EXPECT_TRUE(contains(nothing.second, "text/plain")) << nothing.second;
+  EXPECT_TRUE(
+      contains(nothing.second, "there is nothing at /nothing; the page is at /, and /metrics\n"))
+      << nothing.second;
   EXPECT_EQ(get("/../../../../etc/passwd").first, 404);
   EXPECT_EQ(get("/%2e%2e/%2e%2e/%2e%2e/%2e%2e/etc/passwd").first, 404);
 }
@@ -671,6 +676,26 @@ TEST(ViewCommand, NamesWhatIsWrong) {
   const auto open = refused({"--listen", "0.0.0.0:8765"});
   EXPECT_EQ(open.first, 2);
   EXPECT_TRUE(contains(open.second, "--insecure")) << open.second;
+  for (const char* name : {"localhost:8765", "foo:1"}) {
+    const auto named = refused({"--listen", name});
+    EXPECT_EQ(named.first, 2);
+    EXPECT_TRUE(contains(named.second, "is not a numeric address")) << named.second;
+    EXPECT_FALSE(contains(named.second, "--insecure")) << named.second;
+  }
+  for (const char* host : {"a:b", "http://a", "a/b", ""}) {
+    const auto named = refused({"--host", host});
+    EXPECT_EQ(named.first, 2) << host;
+    EXPECT_TRUE(contains(named.second, "as robot.example.org")) << named.second;
+  }
+  for (const char* origin : {"foxglove", "app.foxglove.dev", "https://app.foxglove.dev/",
+                             "https://App.foxglove.dev", "https://a:443", "https://"}) {
+    const auto named = refused({"--origin", origin});
+    EXPECT_EQ(named.first, 2) << origin;
+    EXPECT_TRUE(contains(named.second, "as https://app.foxglove.dev")) << named.second;
+  }
+  for (const char* origin : {"https://app.foxglove.dev", "http://[::1]:8080", "file://", "null"}) {
+    EXPECT_EQ(refused({"--origin", origin, "--host", "PC-1.local"}).first, 1) << origin;
+  }
   EXPECT_EQ(refused({"--certificate", "a"}).first, 2);
   EXPECT_EQ(refused({"--authority", "a"}).first, 2);
   EXPECT_EQ(refused({"--certificate", "a", "--key", "b", "--revoked", "c"}).first, 2);
@@ -681,6 +706,11 @@ TEST(ViewCommand, NamesWhatIsWrong) {
   EXPECT_TRUE(
       contains(refused({"--config", folder.file("view.conf"), "--listen", "127.0.0.1:0"}).second,
                "/nothing"));
+  std::ofstream(folder.file("typo.conf")) << "lisen = \"127.0.0.1:0\"\n";
+  const auto typo = refused({"--config", folder.file("typo.conf")});
+  EXPECT_EQ(typo.first, 2);
+  EXPECT_TRUE(contains(typo.second, "configuration '" + folder.file("typo.conf"))) << typo.second;
+  EXPECT_TRUE(contains(typo.second, "--lisen")) << typo.second;
   const auto no_daemon = refused({"--listen", "127.0.0.1:0"});
   EXPECT_EQ(no_daemon.first, 1);
   EXPECT_TRUE(contains(no_daemon.second, "/nothing")) << no_daemon.second;
