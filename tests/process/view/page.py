@@ -363,6 +363,30 @@ def described_later(page, stream, later, field):
     page.wait("the field is there still", lambda: field in page.one(card(stream)).text)
 
 
+def pictures(page, rgb, described, jpeg):
+    """Images of colours are drawn: raw ones, those with their size in fields, and JPEGs."""
+    page.may_report = ["willReadFrequently"]  # this check reads pixels
+    page.open("views")
+    pixel = ("const [c, x, y] = arguments;"
+             "return [c.width, c.height, ...c.getContext('2d').getImageData(x, y, 1, 1).data]")
+
+    def at(stream, x, y):
+        return page.run(pixel, page.one(card(stream) + " canvas"), x, y)
+
+    for stream in [rgb, described, jpeg]:
+        page.wait(f"{stream} as an image", lambda: page.get(card(stream), "data-kind") == "image")
+    for x, y in [(40, 30), (159, 119)]:
+        page.wait("RGB", lambda: at(rgb, x, y) == [160, 120, x, y, 200, 255])
+    page.wait("its note", lambda: "160 \u00d7 120, RGB" in page.one(card(rgb)).text)
+    for x, y in [(3, 2), (19, 9)]:
+        page.wait("RGB with fields", lambda: at(described, x, y) == [20, 10, x, y, 100, 255])
+    colour = page.wait("the JPEG", lambda: at(jpeg, 16, 8)[:2] == [32, 16] and at(jpeg, 16, 8)[2:])
+    difference = [abs(a - b) for a, b in zip(colour, [207, 35, 51, 255])]
+    assert max(difference) <= 4, f"the JPEG has the colour {colour}"
+    page.wait("its note", lambda: "32 \u00d7 16, JPEG" in page.one(card(jpeg)).text)
+    page.shot("pictures")
+
+
 def settled(page, streams):
     """Waits until the views show the held instant; returns it."""
     def held():
@@ -639,7 +663,7 @@ def recording(page, stream, late, oldest_ns, newest_ns):
 
 
 CHECKS = {check.__name__: check for check in
-          [overview, signal, axes, slider, oldest, absent, described_later, recreated, link, export, save, views, drive, host_down,
+          [overview, signal, axes, slider, oldest, absent, described_later, pictures, recreated, link, export, save, views, drive, host_down,
            reconnect, phone, recording]}
 
 

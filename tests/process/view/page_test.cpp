@@ -39,6 +39,30 @@ struct Lamp {
 };
 DSSM_DESCRIBE(Lamp, watts, is_on)
 
+struct Photo {
+  std::uint16_t width, height;
+  std::uint8_t channels, pixels[3 * 20 * 10];
+};
+DSSM_DESCRIBE(Photo, width, height, channels, pixels)
+
+// 32 x 16 pixels of the colour 207, 35, 51.
+constexpr std::string_view kJpeg =
+    "ffd8ffe000104a46494600010100000100010000ffdb004300a06e788c7864a08c828cb4aaa0bef0fffff0dcdcf0"
+    "ffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffdb00"
+    "4301aab4b4f0d2f0ffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffffff"
+    "ffffffffffffffffffffffffffffffffffffffffffc00011080010002003012200021101031101ffc40015000101"
+    "00000000000000000000000000000002ffc40014100100000000000000000000000000000000ffc4001601010101"
+    "00000000000000000000000000000103ffc40014110100000000000000000000000000000000ffda000c03010002"
+    "110311003f009011a0003fffd9";
+
+std::vector<std::byte> bytes_of_hex(std::string_view hex) {
+  std::vector<std::byte> bytes;
+  for (std::size_t i = 0; i < hex.size(); i += 2) {
+    bytes.push_back(static_cast<std::byte>(std::stoi(std::string(hex.substr(i, 2)), nullptr, 16)));
+  }
+  return bytes;
+}
+
 constexpr char kMotion[] = "motion:0@pc1";
 
 class ViewPage : public ViewTest {
@@ -175,6 +199,33 @@ TEST_F(ViewPage, DrawsScansPosesImagesAndBytes) {
       session_.create_raw({"raw", 0, ""}, TypeInfo{"", some.size(), 1, {}}, depth_of(8)).value();
   raw.write(some);
   expect_ok("views", {"scan:0@pc1", "pose:0@pc1", "camera:0@pc1", "raw:0@pc1"});
+}
+
+TEST_F(ViewPage, DrawsColours) {
+  // The pixel at column x and row y is (x, y, 200) or (x, y, 100).
+  const auto fill = [](auto* pixels, std::size_t columns, std::size_t rows, int blue) {
+    using Byte = std::remove_pointer_t<decltype(pixels)>;
+    for (std::size_t i = 0; i < columns * rows; ++i) {
+      pixels[3 * i] = static_cast<Byte>(i % columns);
+      pixels[3 * i + 1] = static_cast<Byte>(i / columns);
+      pixels[3 * i + 2] = static_cast<Byte>(blue);
+    }
+  };
+  std::vector<std::byte> picture(std::size_t{3} * 160 * 120);
+  fill(picture.data(), 160, 120, 200);
+  const auto write_raw = [&](const char* name, const std::vector<std::byte>& bytes) {
+    auto stream =
+        session_.create_raw({name, 0, ""}, TypeInfo{"", bytes.size(), 1, {}}, depth_of(8)).value();
+    stream.write(bytes);
+    return stream;
+  };
+  const auto rgb = write_raw("rgb", picture);
+  const auto jpeg = write_raw("jpeg", bytes_of_hex(kJpeg));
+  Photo photo{20, 10, 3, {}};
+  fill(photo.pixels, 20, 10, 100);
+  auto described = session_.create<Photo>("photo", depth_of(8)).value();
+  described.write(photo);
+  expect_ok("pictures", {"rgb:0@pc1", "photo:0@pc1", "jpeg:0@pc1"});
 }
 
 TEST_F(ViewPage, EmptiesViewsWithoutASampleAtTheInstant) {
