@@ -193,11 +193,12 @@ void StateCollector::run() {
     state_.has_all = all;
     if (bool(collected) != is_connected_) {
       is_connected_ = bool(collected);
-      add_event(!is_connected_, is_connected_ ? "dssmd answers again" : collected.error().message);
+      events_.add(!is_connected_,
+                  is_connected_ ? "dssmd answers again" : collected.error().message);
     }
     state_.json["now_ns"] = time_json(WallClock::now());
     state_.json["error"] = collected ? "" : collected.error().message;
-    state_.json["events"] = events_;
+    state_.json["events"] = events_.all();
     on_state_(state_);
     lock.lock();
     changed_.wait_until(lock, next, [&] { return is_ending_ || is_wanted_now_; });
@@ -209,7 +210,8 @@ Result<void> StateCollector::collect(bool all) {
   const std::vector<HostInfo> hosts = DSSM_TRY(session_.list_hosts());
   state_.host = daemon.host;
   state_.streams = DSSM_TRY(session_.list_streams());
-  find_events(hosts);
+  events_.find(hosts, state_.streams);
+  find_incidents();
   Json& json = state_.json;
   json["host"] = daemon.host;
   json["version"] = daemon.version;
@@ -283,74 +285,16 @@ void StateCollector::probe(const StreamInfo& stream) {
   if (reader && reader->incarnation() == stream.incarnation) probe.time = oldest_time(*reader);
 }
 
-void StateCollector::find_events(const std::vector<HostInfo>& hosts) {
-  const bool is_first = !std::exchange(has_state_, true);
-  std::map<std::string, std::pair<HostState, bool>> new_hosts;
-  for (const HostInfo& host : hosts) {
-    if (host.name.empty() || host.reason == HostReason::spare_address) continue;
-    new_hosts[host.name] = {host.state, host.clock_refused};
-    if (is_first) continue;
-    const auto known = hosts_.find(host.name);
-    const bool was_up = known != hosts_.end() && ctl::is_up(known->second.first);
-    if (ctl::is_up(host.state) != was_up) {
-      add_event(was_up, was_up ? fmt::format("host {} is down: {}", host.name,
-                                             host.error.empty() ? "no answer" : host.error)
-                               : fmt::format("host {} is up", host.name));
-    }
-    const bool was_refused = known != hosts_.end() && known->second.second;
-    if (host.clock_refused != was_refused && ctl::is_up(host.state)) {
-      add_event(
-          host.clock_refused,
-          host.clock_refused
-              ? fmt::format("the clock of {} is out of bounds: {}", host.name, host.clock_reason)
-              : fmt::format("the clock of {} is within its bounds again", host.name));
-    }
-  }
-  for (const auto& [name, state] : hosts_) {
-    if (ctl::is_up(state.first) && !new_hosts.contains(name)) {
-      add_event(true, fmt::format("host {} is down: it is not known any more", name));
-    }
-  }
-  hosts_ = std::move(new_hosts);
-
+void StateCollector::find_incidents() {
   std::erase_if(incidents_, [&](const auto& named) {
     return named.second.restart_error() ||
            std::ranges::none_of(state_.streams, [&](const StreamInfo& stream) {
              return stream.id.str() == named.first;
            });
   });
-  std::map<std::string, StreamState> new_streams;
   for (const StreamInfo& stream : state_.streams) {
     if (stream.id.name == ctl::kIncidentStream) find_incidents(stream);
-    if (ctl::is_of_black_box(stream.id)) continue;
-    const std::string name = stream.id.str();
-    const auto known = streams_.find(name);
-    // Of a host that does not answer just now, nothing is known; then the last state counts.
-    const bool is_unknown = stream.state == StreamState::unknown && known != streams_.end();
-    new_streams[name] = is_unknown ? known->second : stream.state;
-    if (is_first) continue;
-    if (known == streams_.end()) {
-      add_event(false, fmt::format("stream {} was created", name));
-      continue;
-    }
-    if (ctl::is_silent(stream) && known->second == StreamState::live) {
-      add_event(true, fmt::format("stream {}: {}", name, name_of(stream.state)));
-    } else if (stream.state == StreamState::live &&
-               (known->second == StreamState::stalled || known->second == StreamState::no_writer)) {
-      add_event(false, fmt::format("stream {} is live again", name));
-    }
   }
-  for (const auto& [name, state] : streams_) {
-    if (new_streams.contains(name)) continue;
-    // The streams of a host that is down are not listed, but may be there still.
-    const auto host = hosts_.find(StreamId::parse(name)->host);
-    if (host != hosts_.end() && !ctl::is_up(host->second.first)) {
-      new_streams[name] = state;
-    } else {
-      add_event(false, fmt::format("stream {} is gone", name));
-    }
-  }
-  streams_ = std::move(new_streams);
 }
 
 // Only those since dssm-view was started.
@@ -371,18 +315,10 @@ void StateCollector::find_incidents(const StreamInfo& stream) {
     if (incident->time() < started_) continue;
     const ctl::RecordedIncident& found = incident->value;
     const std::string reason = ctl::text_in(found.reason);
-    add_event(true, fmt::format("incident recorded on {}: {} of {}{}; {}", stream.id.host,
-                                ctl::text_in(found.trigger), ctl::text_in(found.host),
-                                reason.empty() ? "" : ": " + reason, ctl::text_in(found.file)));
+    events_.add(true, fmt::format("incident recorded on {}: {} of {}{}; {}", stream.id.host,
+                                  ctl::text_in(found.trigger), ctl::text_in(found.host),
+                                  reason.empty() ? "" : ": " + reason, ctl::text_in(found.file)));
   }
-}
-
-void StateCollector::add_event(bool is_warning, std::string text) {
-  events_.push_back({{"number", ++last_event_},
-                     {"time_ns", time_json(WallClock::now())},
-                     {"severity", is_warning ? "warn" : "info"},
-                     {"text", std::move(text)}});
-  if (events_.size() > kMaxEvents) events_.pop_front();
 }
 
 }  // namespace dssm::view

@@ -7,7 +7,6 @@
 
 #include <condition_variable>
 #include <cstdint>
-#include <deque>
 #include <dssm/recording.hpp>
 #include <dssm/session.hpp>
 #include <functional>
@@ -21,11 +20,9 @@
 
 #include "client/dssmctl/black_box_streams.hpp"
 #include "client/dssmctl/output.hpp"
+#include "client/view/events.hpp"
 
 namespace dssm::view {
-
-// JavaScript's numbers are too coarse for nanoseconds since 1970, so times are texts.
-inline ctl::Json time_json(Time time) { return std::to_string(to_ns(time)); }
 
 struct TimeRange {
   Time first, last;
@@ -74,7 +71,6 @@ class StateCollector {
   static constexpr Duration kPeriod = std::chrono::seconds(1);
   static constexpr Duration kWantedTime = std::chrono::seconds(5);
   static constexpr Duration kFindingsPeriod = std::chrono::seconds(10);
-  static constexpr std::size_t kMaxEvents = 200;
   static constexpr std::size_t kMaxProbes = 32;  // in one turn; each opens a stream
   static constexpr int kMaxIncidents = 64;       // of one black box, in one turn
 
@@ -83,9 +79,8 @@ class StateCollector {
   // A guess for each stream, and the true time for this PC's, if all is wanted.
   void find_oldest(bool all);
   void probe(const StreamInfo& stream);
-  void find_events(const std::vector<HostInfo>& hosts);
+  void find_incidents();
   void find_incidents(const StreamInfo& stream);
-  void add_event(bool is_warning, std::string text);
 
   Session session_;
   const std::string socket_path_;
@@ -96,10 +91,7 @@ class StateCollector {
   // The thread's.
   VehicleState state_;
   MonoTime next_findings_{};
-  bool has_state_ = false;
   bool is_connected_ = true;
-  std::map<std::string, std::pair<HostState, bool>> hosts_;  // and whether its clock is refused
-  std::map<std::string, StreamState> streams_;
   std::map<std::string, Reader<ctl::RecordedIncident>> incidents_;  // of all black boxes
   // When the oldest sample of a stream is from.
   struct Probe {
@@ -109,8 +101,7 @@ class StateCollector {
     std::optional<Time> time;  // empty: it could not be read
   };
   std::map<std::string, Probe> probes_;  // of streams of this PC
-  std::deque<ctl::Json> events_;
-  std::uint64_t last_event_ = 0;
+  Events events_;
 
   std::mutex mutex_;
   std::condition_variable changed_;

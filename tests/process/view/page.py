@@ -663,8 +663,8 @@ def recording(page, stream, late, oldest_ns, newest_ns):
 
 
 CHECKS = {check.__name__: check for check in
-          [overview, signal, axes, slider, oldest, absent, described_later, pictures, recreated, link, export, save, views, drive, host_down,
-           reconnect, phone, recording]}
+          [overview, signal, axes, slider, oldest, absent, described_later, pictures, recreated,
+           link, export, save, views, drive, host_down, reconnect, phone, recording]}
 
 
 def main(check, url, folder, *arguments):

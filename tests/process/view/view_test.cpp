@@ -237,6 +237,21 @@ TEST_F(View, StatesWhenTheOldestSamplesAreFrom) {
   await_streams_in_overview([&](const Json& streams) { return streams[0]["oldest_ns"] == later; });
 }
 
+TEST_F(View, TellsOfAStreamThatStalls) {
+  auto motion = session_.create<Motion>("motion", depth_of(64)).value();
+  const auto overview = [&] { return ask({{"op", "overview"}}); };
+  await([&] {
+    motion.write({});
+    const Json streams = overview()["streams"];
+    return streams.size() == 1 && streams[0]["state"] == "live";
+  });
+  await([&] { return contains(overview()["events"].dump(), "\"stream motion:0@pc1: stalled\""); });
+  await([&] {
+    motion.write({});
+    return contains(overview()["events"].dump(), "\"stream motion:0@pc1 is live again\"");
+  });
+}
+
 // As a black box announces it.
 TEST_F(View, TellsOfRecordedIncidents) {
   ctl::RecordedIncident incident{};
