@@ -244,6 +244,12 @@ Result<void> StateCollector::collect(bool all) {
   return {};
 }
 
+// One that could not be read, perhaps because this user may not, is not tried each second.
+bool StateCollector::is_due(const Probe& probe, const StreamInfo& stream) {
+  if (!probe.time) return MonoClock::now() - probe.at > kRefusedPause;
+  return probe.oldest != stream.oldest;
+}
+
 void StateCollector::find_oldest(bool all) {
   state_.oldest.clear();
   std::vector<std::pair<MonoTime, std::size_t>> due;  // by the times of their last probes
@@ -255,7 +261,7 @@ void StateCollector::find_oldest(bool all) {
     const auto probed = probes_.find(stream.id.str());
     const bool is_known =
         probed != probes_.end() && probed->second.incarnation == stream.incarnation;
-    if (!is_known || probed->second.oldest != stream.oldest) {
+    if (!is_known || is_due(probed->second, stream)) {
       due.emplace_back(is_known ? probed->second.at : MonoTime(), i);
     }
     if (is_known) known.insert(*probed);

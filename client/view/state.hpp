@@ -72,13 +72,23 @@ class StateCollector {
   static constexpr Duration kWantedTime = std::chrono::seconds(5);
   static constexpr Duration kFindingsPeriod = std::chrono::seconds(10);
   static constexpr std::size_t kMaxProbes = 32;  // in one turn; each opens a stream
-  static constexpr int kMaxIncidents = 64;       // of one black box, in one turn
+  static constexpr Duration kRefusedPause = std::chrono::seconds(30);
+  static constexpr int kMaxIncidents = 64;  // of one black box, in one turn
+
+  // When the oldest sample of a stream is from.
+  struct Probe {
+    std::uint64_t incarnation;
+    Tid oldest;
+    MonoTime at;
+    std::optional<Time> time;  // empty: it could not be read
+  };
 
   void run();
   Result<void> collect(bool all);
   // A guess for each stream, and the true time for this PC's, if all is wanted.
   void find_oldest(bool all);
   void probe(const StreamInfo& stream);
+  static bool is_due(const Probe& probe, const StreamInfo& stream);
   void find_incidents();
   void find_incidents(const StreamInfo& stream);
 
@@ -93,14 +103,7 @@ class StateCollector {
   MonoTime next_findings_{};
   bool is_connected_ = true;
   std::map<std::string, Reader<ctl::RecordedIncident>> incidents_;  // of all black boxes
-  // When the oldest sample of a stream is from.
-  struct Probe {
-    std::uint64_t incarnation;
-    Tid oldest;
-    MonoTime at;
-    std::optional<Time> time;  // empty: it could not be read
-  };
-  std::map<std::string, Probe> probes_;  // of streams of this PC
+  std::map<std::string, Probe> probes_;                             // of streams of this PC
   Events events_;
 
   std::mutex mutex_;

@@ -308,6 +308,23 @@ def oldest(page, stream, oldest_ns, second_ns):
         assert settled(page, [stream]) == t
 
 
+def oldest_live(page, stream):
+    """Of a ring that loses its oldest samples meanwhile, Home and Play begin where some are left."""
+    page.open("views", views=[{"stream": stream}])
+    page.wait("the ring is full", lambda: int(page.get(card(stream), "data-tid") or 0) > 400)
+    first = int(page.get("#time", "data-oldest-ns"))
+    page.wait("the ring goes on", lambda: int(page.get("#time", "data-oldest-ns")) > first)
+    page.press(Keys.HOME)
+    t = int(settled(page, [stream]))
+    assert t < int(page.get("#time", "data-oldest-ns")) + 2 * 10**9
+    page.press("l")
+    page.wait("live", lambda: page.get("#time", "data-mode") == "live")
+    page.press("r")
+    page.wait("it plays", lambda: page.get("#time", "data-mode") == "play")
+    first = page.wait("a sample", lambda: page.get(card(stream), "data-tid"))
+    page.wait("later ones", lambda: int(page.get(card(stream), "data-tid") or 0) > int(first) + 20)
+
+
 def absent(page, early, late, image):
     """At an instant where a stream has no sample, its view is empty and says why."""
     page.may_report = ["willReadFrequently"]  # this check reads pixels
@@ -663,8 +680,8 @@ def recording(page, stream, late, oldest_ns, newest_ns):
 
 
 CHECKS = {check.__name__: check for check in
-          [overview, signal, axes, slider, oldest, absent, described_later, pictures, recreated,
-           link, export, save, views, drive, host_down, reconnect, phone, recording]}
+          [overview, signal, axes, slider, oldest, oldest_live, absent, described_later, pictures,
+           recreated, link, export, save, views, drive, host_down, reconnect, phone, recording]}
 
 
 def main(check, url, folder, *arguments):

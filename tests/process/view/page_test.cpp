@@ -168,6 +168,15 @@ TEST_F(ViewPage, StepsFromTheOldestSample) {
   expect_ok("oldest", {kMotion, std::to_string(ns(0)), std::to_string(ns(1))});
 }
 
+TEST_F(ViewPage, BeginsWhereARingThatIsWrittenHasSamples) {
+  auto motion = session_.create<Wheels>("motion", depth_of(301)).value();  // 3 s
+  Running page(page_argv("oldest_live", {kMotion}), {});
+  lines(page, [&] {
+    motion.write({});
+    std::this_thread::sleep_for(std::chrono::milliseconds(10));  // the stream's cycle
+  });
+}
+
 TEST_F(ViewPage, KeepsWhatIsChosenInItsUrl) {
   auto motion = session_.create<Wheels>("motion", depth_of(8)).value();
   motion.write({});
