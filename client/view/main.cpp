@@ -13,8 +13,10 @@
 #include <cstdio>
 #include <dssm/recording.hpp>
 #include <dssm/session.hpp>
+#include <initializer_list>
 #include <optional>
 #include <string>
+#include <string_view>
 #include <utility>
 #include <variant>
 #include <vector>

@@ -103,6 +103,17 @@ class ViewRecording : public testing::Test {
   std::string url_;
 };
 
+// Metrics are the vehicle's.
+TEST_F(ViewRecording, HasNoMetrics) {
+  const Finished finished = run({"/usr/bin/python3", "-c",
+                                 "import sys, urllib.request, urllib.error\n"
+                                 "try: urllib.request.urlopen(sys.argv[1])\n"
+                                 "except urllib.error.HTTPError as error:\n"
+                                 "  print(error.code, error.read().decode())\n",
+                                 url_ + "metrics"});
+  EXPECT_EQ(finished.out, "404 there is nothing at /metrics; the page is at /\n\n") << finished.err;
+}
+
 TEST_F(ViewRecording, IsListedWithItsStreams) {
   const Json answer = ask({{"op", "overview"}});
   EXPECT_EQ(answer["recording"], Json({"drive.mcap"}));
