@@ -80,10 +80,11 @@ CLI::Option* add_seconds(CLI::App* app, const std::string& name, const std::stri
 }
 
 CLI::Option* add_moment(CLI::App* app, const std::string& name, const std::string& description,
-                        std::optional<Moment>& target) {
+                        std::optional<Moment>& target,
+                        Result<Moment> (*parse)(std::string_view, Time) = parse_moment) {
   return add_parsed(app, name, "TIME", description,
-                    [&target](const std::string& text) -> Result<void> {
-                      target = DSSM_TRY(parse_moment(text, WallClock::now()));
+                    [&target, parse](const std::string& text) -> Result<void> {
+                      target = DSSM_TRY(parse(text, WallClock::now()));
                       return {};
                     });
 }
@@ -603,9 +604,12 @@ void add_play(CLI::App& app, Parsed& parsed) {
             fmt::format("'{}' is not a rate from 0.001 to 1000000, or from -1000000 to -0.001",
                         text)};
       });
-  add_moment(play, "--from", "begin at TIME: seconds since 1970, ISO 8601, or before the end (-3s)",
-             options.from);
-  add_moment(play, "--to", "end at TIME", options.to);
+  add_moment(
+      play, "--from",
+      "begin at TIME: so long after the recording's beginning (+2s) or before its end (-3s), "
+      "seconds since 1970, or ISO 8601",
+      options.from, parse_recorded_moment);
+  add_moment(play, "--to", "end at TIME", options.to, parse_recorded_moment);
   play->add_flag("-p,--start-paused", options.start_paused, "until Space is pressed");
   CLI::Option* const loop =
       play->add_flag("-l,--loop", options.loop, "again and again, until Ctrl-C");

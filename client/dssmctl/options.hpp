@@ -144,7 +144,7 @@ struct PlayOptions : CommonOptions {
   std::vector<std::string> mappings;  // PATTERN=NAME
   double rate = 1;                    // negative: backwards
   bool start_paused = false, this_host = false;
-  std::optional<Moment> from, to;     // count back from the recording's end
+  std::optional<Moment> from, to;     // offsets are from the recording's ends
   std::vector<std::string> lockstep;  // commands; empty: by the clock
   bool loop = false, now = false, on_hosts = false, force = false;
 };

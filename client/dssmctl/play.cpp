@@ -50,18 +50,30 @@ Result<PlayedPart> played_part(const Recording& recording, const PlayOptions& op
   if (whole.from > whole.to) {
     return Error{Errc::not_found, fmt::format("'{}' has no samples", escaped(options.file))};
   }
+  const auto refused = [&](std::string_view problem) {
+    return Error{Errc::invalid_argument,
+                 fmt::format("{}; '{}' goes from {} to {} ({}). As offsets: +2s is 2 s after its "
+                             "beginning, -3s is 3 s before its end",
+                             problem, escaped(options.file), time_text(whole.from, options.iso),
+                             time_text(whole.to, options.iso),
+                             duration_text(saturating_sub(whole.to, whole.from)))};
+  };
+  // An offset beyond the other end, as the last 10 s of a recording of 5 s, means that end. But a
+  // time outside of the recording is an error: the clocks would be set to it, and nothing played.
   const auto moment = [&](const std::optional<Moment>& wanted, Time otherwise) {
     if (!wanted) return otherwise;
-    return wanted->back ? saturating_add(whole.to, *wanted->back) : wanted->time;
+    if (wanted->back) return saturating_add(whole.to, *wanted->back);
+    return wanted->after_start ? saturating_add(whole.from, *wanted->after_start) : wanted->time;
   };
-  const PlayedPart range{moment(options.from, whole.from), moment(options.to, whole.to)};
-  if (range.from > whole.to || range.to < whole.from || range.from > range.to) {
-    return Error{Errc::invalid_argument,
-                 fmt::format("--from and --to: there is nothing between them; '{}' goes from {} to "
-                             "{}",
-                             escaped(options.file), time_text(whole.from, options.iso),
-                             time_text(whole.to, options.iso))};
-  }
+  const auto is_outside = [&](const std::optional<Moment>& wanted) {
+    return wanted && !wanted->back && !wanted->after_start &&
+           (wanted->time < whole.from || wanted->time > whole.to);
+  };
+  if (is_outside(options.from)) return refused("--from: that is outside of the recording");
+  if (is_outside(options.to)) return refused("--to: that is outside of the recording");
+  const PlayedPart range{std::max(moment(options.from, whole.from), whole.from),
+                         std::min(moment(options.to, whole.to), whole.to)};
+  if (range.from > range.to) return refused("--from and --to: there is nothing between them");
   return range;
 }
 

@@ -450,6 +450,16 @@ Result<Moment> parse_moment(std::string_view text, Time now) {
   return is_back ? Moment{{}, *value} : Moment{Time(*value)};
 }
 
+Result<Moment> parse_recorded_moment(std::string_view text, Time now) {
+  if (!text.starts_with('+')) return parse_moment(text, now);
+  const std::string_view rest = text.substr(1);
+  const Result<Duration> after = parse_duration(rest);
+  if (!after || rest.starts_with('+') || rest.starts_with('-')) {
+    return bad(text, "is not a time after the beginning: write +2, +2.5s or +1min");
+  }
+  return Moment{{}, {}, *after};
+}
+
 Result<std::uint64_t> parse_whole(std::string_view text, std::uint64_t min, std::uint64_t max) {
   std::uint64_t value = 0;
   const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), value);

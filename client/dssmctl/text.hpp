@@ -92,6 +92,8 @@ struct Moment {
   // Negative or 0: so long before another moment, which depends on the option; `time` is
   // meaningless.
   std::optional<Duration> back = {};
+  // Of a recording: so long after its beginning; `time` is meaningless.
+  std::optional<Duration> after_start = {};
 
   friend bool operator==(const Moment&, const Moment&) = default;
 };
@@ -100,6 +102,9 @@ struct Moment {
 // "2026-11-27 08:00:00.5Z", "2026-11-27T08:00:00+09:00"; without an offset in the local time zone),
 // "now", or with a minus sign how long before ("-3s", "-1.5"). Fails with invalid_argument.
 Result<Moment> parse_moment(std::string_view text, Time now);
+
+// The same of a recording: also "+2s", so long after its beginning.
+Result<Moment> parse_recorded_moment(std::string_view text, Time now);
 
 // Reads a whole number from `min` to `max`. Fails with invalid_argument.
 Result<std::uint64_t> parse_whole(std::string_view text, std::uint64_t min, std::uint64_t max);

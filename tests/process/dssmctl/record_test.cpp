@@ -545,6 +545,27 @@ TEST_F(Play, PlaysAPartUnderAnotherName) {
   EXPECT_TRUE(contains(ctl({"play", file_, "camera"}).err, "no stream of the recording fits"));
 }
 
+TEST_F(Play, CountsTimesFromBothEnds) {
+  make_recording();
+  output({"play", file_, "--map", "pose=copy", "--from", "+10ms", "--to", "+0.02"});
+  expect_played("copy", 10, 20);
+  output({"play", file_, "--map", "pose=all", "--from", "-1h", "--to", "+1h"});
+  expect_played("all", 0, 99);
+}
+
+// Otherwise it would drive the clocks of all hosts to that time and play nothing.
+TEST_F(Play, RefusesTimesOutsideOfTheRecording) {
+  make_recording();
+  for (const std::vector<std::string>& words : std::vector<std::vector<std::string>>{
+           {"--from", "0.5"}, {"--to", "100"}, {"--from", "+1h"}, {"--to", "-1h"}}) {
+    const Finished refused = ctl({"play", file_, words[0], words[1], "--rate", "1e6"});
+    EXPECT_EQ(refused.exit_status, 2) << words[1];
+    EXPECT_TRUE(contains(refused.err, "goes from 1.000000000 to 1.099000000")) << refused.err;
+    EXPECT_TRUE(contains(refused.err, "+2s is 2 s after its beginning")) << refused.err;
+  }
+  EXPECT_EQ(ctl({"play", file_, "--from", "+-2s"}).exit_status, 2);
+}
+
 // By the clock, so that programs may follow or stop it.
 TEST_F(Play, IsPacedByThePlaybackClockAndResetsIt) {
   make_recording();

@@ -180,6 +180,14 @@ TEST(Text, ReadsMomentsInEveryForm) {
   EXPECT_EQ(parse_moment("-500ms", kNow)->back, -500ms);
   EXPECT_EQ(parse_moment("-1.5", kNow)->back, -1500ms);
   EXPECT_EQ(parse_moment("-0", kNow)->back, 0s);
+  EXPECT_FALSE(parse_moment("+2s", kNow));
+  EXPECT_EQ(parse_recorded_moment("+2s", kNow)->after_start, 2s);
+  EXPECT_EQ(parse_recorded_moment("+0.5", kNow)->after_start, 500ms);
+  EXPECT_EQ(parse_recorded_moment("-3s", kNow)->back, -3s);
+  EXPECT_EQ(parse_recorded_moment("1795766400", kNow)->time, kNow);
+  for (const char* text : {"+", "+-2s", "++2s", "+soon"}) {
+    EXPECT_FALSE(parse_recorded_moment(text, kNow)) << text;
+  }
   ::unsetenv("TZ");
   ::tzset();
 }
