@@ -4,6 +4,8 @@
 // itself.
 #include <fmt/format.h>
 
+#include <filesystem>
+
 #include "client/dssmctl/describe.hpp"
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/options.hpp"
@@ -231,16 +233,30 @@ Result<void> print_stream_info(Session& session, const StreamId& id, const InfoO
   return {};
 }
 
-}  // namespace
-
-Result<void> run(const InfoOptions& options, Output& out) {
-  if (is_recording(options.stream)) return print_recording(options.stream, options, out);
+Result<void> print_live(const InfoOptions& options, Output& out) {
   std::optional<StreamId> id;
   if (!options.stream.empty()) id = DSSM_TRY(StreamId::parse(options.stream));
   Session session = DSSM_TRY(connect(options));
   return print_once_or_watch(options.watch, options.json, out, [&] {
     return id ? print_stream_info(session, *id, options, out) : print_daemon(session, options, out);
   });
+}
+
+}  // namespace
+
+Result<void> run(const InfoOptions& options, Output& out) {
+  if (is_recording(options.stream)) {
+    print_recording(DSSM_TRY(open_readable(options.stream)), options, out);
+    return {};
+  }
+  Result<void> shown = print_live(options, out);
+  std::error_code ignored;
+  if (shown || options.watch || !std::filesystem::exists(options.stream, ignored)) return shown;
+  // `record -o NAME` makes a file, or fills a folder, that nothing tells from a stream's name.
+  const Result<Recording> recording = open_readable(options.stream);
+  if (!recording) return shown;
+  print_recording(*recording, options, out);
+  return {};
 }
 
 }  // namespace dssm::ctl

@@ -328,8 +328,10 @@ void add_info(CLI::App& app, Parsed& parsed) {
   InfoOptions& options = add_options<InfoOptions>(info, parsed, [](const InfoOptions& all) {
     require(!all.watch || !is_recording(all.stream), "--watch: of a stream, not of a recording");
   });
-  info->add_option("STREAM", options.stream,
-                   std::string(kStreamHelp) + "; or a recording: a file *.mcap or *.log, or a path")
+  info->add_option(
+          "STREAM", options.stream,
+          std::string(kStreamHelp) +
+              "; or a recording: a file *.mcap or *.log, a path, or a name that no stream has")
       ->type_name("");
   add_watch(info, options.watch);
 }

@@ -21,6 +21,19 @@ namespace {
 
 // By then the streams that there are could have been opened.
 constexpr Duration kFirstNoticeTime = std::chrono::seconds(1);
+
+// A folder is not created: it may be a disk that is not mounted, or a wrong name.
+Result<void> check_folder(const std::filesystem::path& folder) {
+  std::error_code ignored;
+  if (folder.empty() ||
+      std::filesystem::status(folder, ignored).type() != std::filesystem::file_type::not_found) {
+    return {};
+  }
+  return Error{Errc::not_found,
+               fmt::format("record in '{0}': there is no such folder; `mkdir -p '{0}'` creates it",
+                           escaped(folder.string()))};
+}
+
 std::filesystem::path file_of(const RecordOptions& options) {
   const std::string name = recording_name(WallClock::now());
   if (options.file.empty()) return name;
@@ -156,6 +169,9 @@ Json recording_json(const std::filesystem::path& file, const Recorder& recorder)
 
 Result<void> run(const RecordOptions& options, Output& out) {
   if (!options.repair.empty()) return repair(options, out);
+  const bool is_folder = options.black_box || options.file.ends_with('/');
+  const std::filesystem::path output = options.file;
+  DSSM_TRY(check_folder(is_folder ? output : output.parent_path()));
   Session session = DSSM_TRY(connect(options));
   RecordingOptions how;
   how.compression = compression_of(options.compression);

@@ -153,23 +153,28 @@ Result<Recording> open_recording(const std::string& file, const std::vector<std:
   return Recording::open(files);
 }
 
+Result<Recording> open_readable(const std::string& path) {
+  Recording recording = DSSM_TRY(Recording::open(path));
+  const std::vector<std::string> warnings = recording.warnings();
+  if (recording.streams().empty() && !warnings.empty()) {
+    return Error{Errc::not_found, fmt::format("'{}' has no stream that can be read; {}",
+                                              escaped(path), list_text(warnings))};
+  }
+  return recording;
+}
+
 Compression compression_of(const std::string& name) {
   return name == "none" ? Compression::none : name == "zstd" ? Compression::zstd : Compression::lz4;
 }
 
-Result<void> print_recording(const std::string& path, const InfoOptions& options, Output& out) {
-  const Recording recording = DSSM_TRY(Recording::open(path));
+void print_recording(const Recording& recording, const InfoOptions& options, Output& out) {
   const Sum sum = sum_of(recording);
-  if (options.json) {
-    print_json(recording, sum, out);
-    return {};
-  }
+  if (options.json) return print_json(recording, sum, out);
   print_text(recording, sum, options.iso, out);
   out.flush();
   for (const std::string& warning : recording.warnings()) {
     print_error(fmt::format("dssmctl: info: {}\n", escaped_message(warning)));
   }
-  return {};
 }
 
 }  // namespace dssm::ctl

@@ -19,10 +19,13 @@ bool is_recording(const std::string& name);
 // A recording of several files, or of one file or folder: when `more` is empty.
 Result<Recording> open_recording(const std::string& file, const std::vector<std::string>& more);
 
+// Of a file or folder, for people: unlike Recording::open() it fails when no stream can be read of
+// a file that is empty, cut off or damaged.
+Result<Recording> open_readable(const std::string& path);
+
 // Of the option --compression.
 Compression compression_of(const std::string& name);
 
-// `path` is a file, or a folder with the files of one recording.
-Result<void> print_recording(const std::string& path, const InfoOptions& options, Output& out);
+void print_recording(const Recording& recording, const InfoOptions& options, Output& out);
 
 }  // namespace dssm::ctl

@@ -442,7 +442,7 @@ TEST_F(BlackBox, SaysWhatIsWrong) {
   EXPECT_TRUE(contains(none.err, "no host has a black box that waits for triggers")) << none.err;
   const Finished folder = ctl({"record", "--black-box", "-o", folder_.file("no")});
   EXPECT_EQ(folder.exit_status, 1);
-  EXPECT_TRUE(contains(folder.err, folder_.file("no") + "'")) << folder.err;
+  EXPECT_TRUE(contains(folder.err, "mkdir -p '" + folder_.file("no") + "'")) << folder.err;
   std::ofstream(folder_.file("record.conf")) << "black_box = true\nbefor = \"10s\"\n";
   const Finished config = ctl({"record", "--config", folder_.file("record.conf")});
   EXPECT_EQ(config.exit_status, 2);

@@ -336,6 +336,44 @@ TEST_F(Record, InfoTakesNamesWithASlashForStreams) {
   EXPECT_TRUE(contains(output({"info", "robot/pose"}), "robot/pose"));
 }
 
+// Folders and files that `record -o NAME` makes have names as streams have.
+TEST_F(Record, InfoTakesNamesOfRecordingsInTheWorkingDirectory) {
+  const auto pose = session_.create<RecordedPose>("pose", depth_of(4)).value();
+  std::filesystem::create_directory(folder_.file("drives"));
+  output({"record", "--for", "1ms", "-o", folder_.file("drives")});
+  output({"record", "--for", "1ms", "-o", folder_.file("bare")});
+  std::filesystem::create_directory(folder_.file("empty"));
+  std::ofstream(folder_.file("notes")) << "of a meeting\n";
+  const auto info = [&](const std::string& name) {
+    return dssm::test::run(
+        {"sh", "-c", "cd '" + folder_.path() + "' && '" + dssmctl_path() + "' info " + name},
+        environment());
+  };
+  for (const char* name : {"drives", "bare"}) {
+    const Finished shown = info(name);
+    EXPECT_EQ(shown.exit_status, 0) << shown.err;
+    EXPECT_TRUE(contains(shown.out, "files:")) << shown.out;
+    EXPECT_TRUE(contains(shown.out, "pose")) << shown.out;
+  }
+  for (const char* name : {"empty", "notes", "none"}) {
+    const Finished none = info(name);
+    EXPECT_EQ(none.exit_status, 1);
+    EXPECT_TRUE(contains(none.err, std::string("stream '") + name)) << none.err;
+  }
+  const auto same = session_.create<RecordedPose>("bare", depth_of(4)).value();
+  EXPECT_TRUE(contains(info("bare").out, "owner:")) << "a stream comes first";
+}
+
+TEST_F(Record, InfoFailsWhenNothingCanBeRead) {
+  for (const char* content : {"", "\x89MCAP"}) {
+    std::ofstream(file_, std::ios::trunc) << content;
+    const Finished info = ctl({"info", file_});
+    EXPECT_EQ(info.exit_status, 1);
+    EXPECT_EQ(info.out, "");
+    EXPECT_TRUE(contains(info.err, "has no stream that can be read")) << info.err;
+  }
+}
+
 // What a ring overwrites while the recorder stands still.
 TEST_F(Record, CountsWhatWasLostInTheFile) {
   auto pose = session_.create<RecordedPose>("pose", depth_of(16)).value();
@@ -412,7 +450,10 @@ TEST_F(Record, EndsInTimeAndShowsNumbersForPrograms) {
 TEST_F(Record, SaysWhatIsWrong) {
   const Finished folder = ctl({"record", "-o", folder_.file("no/a.mcap")});
   EXPECT_EQ(folder.exit_status, 1);
-  EXPECT_TRUE(contains(folder.err, "no/a.mcap")) << folder.err;
+  EXPECT_TRUE(contains(folder.err, "mkdir -p '" + folder_.file("no") + "'")) << folder.err;
+  const Finished slash = ctl({"record", "--for", "1ms", "-o", folder_.file("no/")});
+  EXPECT_EQ(slash.exit_status, 1);
+  EXPECT_TRUE(contains(slash.err, "mkdir -p '" + folder_.file("no/") + "'")) << slash.err;
   EXPECT_EQ(ctl({"record", "--for", "1ms", "-o", file_}).exit_status, 0);
   const Finished again = ctl({"record", "--for", "1ms", "-o", file_});
   EXPECT_EQ(again.exit_status, 1);
