@@ -30,6 +30,11 @@
 namespace dssm::ctl {
 namespace {
 
+// Of programs that poll instead.
+constexpr std::string_view kWaysToWait =
+    "a read that waits (in SSM: setBlocking(true) before readNext()), usleepSSM() or "
+    "PlaybackClock::sleep_until(), in place of usleep()";
+
 using clock::LockstepPage;
 using clock::LockstepPlace;
 
@@ -342,15 +347,14 @@ Result<bool> Lockstep::await_start() {
       if (now - begin > kMaxStartTime) {
         return Error{Errc::unavailable,
                      fmt::format("'{}' waits neither for a sample nor by the playback clock; "
-                                 "lockstep needs that: a read that waits, usleepSSM() or "
-                                 "PlaybackClock::sleep_until(), in place of usleep()",
-                                 escaped(program->command))};
+                                 "lockstep needs that: {}",
+                                 escaped(program->command), kWaysToWait)};
       }
       if (!noticed && now - begin > kStartNotice) {
         noticed = true;
         out_.clear_line();
-        print_error(fmt::format("dssmctl: play: waiting until '{}' waits for samples\n",
-                                escaped(program->command)));
+        print_error(fmt::format("dssmctl: play: waiting until '{}' waits for samples: {}\n",
+                                escaped(program->command), kWaysToWait));
       }
       if (!pause(std::chrono::milliseconds(20))) return false;
     }

@@ -114,7 +114,9 @@ TEST_F(Lockstep, SaysWhichProgramFailed) {
 
 TEST_F(Lockstep, WaitsForAProgramThatWaitsForNothingAndSaysSo) {
   Running running(argv({"play", file_, "--lockstep", "exec sleep 1000"}), environment());
-  EXPECT_TRUE(contains(running.line(), "waiting until 'exec sleep 1000' waits for samples"));
+  const std::string line = running.line();
+  EXPECT_TRUE(contains(line, "waiting until 'exec sleep 1000' waits for samples")) << line;
+  EXPECT_TRUE(contains(line, "setBlocking(true)")) << line;
   running.signal(SIGINT);
   EXPECT_EQ(running.status(), 0);
 }
