@@ -69,9 +69,9 @@ Result<void> check_replaceable(const StreamInfo& stream, const DescribeOptions& 
   if (options.force) return {};
   if (!stream.type.fields.empty()) {
     return Error{Errc::conflict,
-                 fmt::format("describe '{}': its fields are described already, as {}; --force "
-                             "replaces them",
-                             stream.id.str(), stream.type.description())};
+                 fmt::format("describe '{0}': its fields are described already (`dssmctl info {0}` "
+                             "shows them); --force replaces them",
+                             stream.id.str())};
   }
   if (!options.type.empty() && !stream.type.name.empty() && options.type != stream.type.name) {
     return Error{Errc::conflict,

@@ -95,6 +95,7 @@ TEST_F(Describe, GivesTheStreamOfAProgramNamesThatStay) {
   const Finished again = ctl({"describe", "spur_odometry:3", "--from", "/proc/self/exe"});
   EXPECT_EQ(again.exit_status, 1);
   EXPECT_THAT(again.err, HasSubstr("--force"));
+  EXPECT_THAT(again.err, Not(HasSubstr("theta"))) << "one line, whatever the type has";
 }
 
 TEST_F(Describe, EchoShowsTheFieldsOfAProgramThatRuns) {
