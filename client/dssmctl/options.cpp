@@ -510,6 +510,9 @@ void check_record(RecordOptions& options) {
 void add_record(CLI::App& app, Parsed& parsed) {
   CLI::App* record = app.add_subcommand("record", "record streams of all hosts in an MCAP file");
   RecordOptions& options = add_options<RecordOptions>(record, parsed, check_record);
+  record->footer(
+      "Of a stream without a description the file has only bytes; `dssmctl describe STREAM` before "
+      "the recording gives it fields.");
   record
       ->add_option("PATTERN", options.patterns,
                    "only streams whose NAME or NAME:ID one of these shell patterns fits (default: "

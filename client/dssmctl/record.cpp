@@ -2,6 +2,7 @@
 //
 // dssmctl record: streams into an MCAP file, until Ctrl-C or a given time.
 #include <fmt/format.h>
+#include <fnmatch.h>
 
 #include <algorithm>
 #include <filesystem>
@@ -44,12 +45,36 @@ std::filesystem::path file_of(const RecordOptions& options) {
   return options.file;
 }
 
+bool is_planned(const StreamInfo& stream, const RecorderPlan& plan) {
+  const auto fits = [&](const std::string& type) {
+    return ::fnmatch(type.c_str(), stream.type.name.c_str(), 0) == 0;
+  };
+  return plan.filter.takes(stream.id) &&
+         (plan.types.empty() || std::ranges::any_of(plan.types, fits));
+}
+
+// Of those that are recorded and still there: the recording has only their bytes.
+std::vector<std::string> streams_without_fields(Session& session, const RecorderPlan& plan) {
+  std::vector<std::string> names;
+  const Result<std::vector<StreamInfo>> all = session.list_streams();
+  if (!all) return names;
+  for (const StreamInfo& stream : *all) {
+    if (!is_planned(stream, plan) || !stream.type.fields.empty()) continue;
+    // Lists leave out the fields of many types.
+    const Result<StreamInfo> info = session.stream_info(stream.id);
+    if (info && info->type.fields.empty()) names.push_back(stream.id.str());
+  }
+  return names;
+}
+
 // Records until it is to end, and says how it goes: on a terminal in a line that is redrawn.
 class RecordingRun {
  public:
-  RecordingRun(const RecordOptions& options, std::filesystem::path file, Recorder& recorder,
-               RecordingFolder& folder, Output& out)
+  RecordingRun(const RecordOptions& options, Session session, const RecorderPlan& plan,
+               std::filesystem::path file, Recorder& recorder, RecordingFolder& folder, Output& out)
       : options_(options),
+        session_(std::move(session)),
+        plan_(plan),
         file_(std::move(file)),
         recorder_(recorder),
         folder_(folder),
@@ -67,6 +92,7 @@ class RecordingRun {
     Result<void> finished = recorder_.finish();
     if (finished) finished = keep_quota();
     report_notices();
+    report_undescribed();
     out_.clear_line();
     print_summary();
     return recorded ? finished : recorded;
@@ -104,6 +130,16 @@ class RecordingRun {
     for (const std::string& text : recorder_.take_notices()) notice(text);
   }
 
+  void report_undescribed() {
+    if (recorder_.streams() == 0) return;
+    const std::vector<std::string> names = streams_without_fields(session_, plan_);
+    if (names.empty()) return;
+    notice(
+        fmt::format("without descriptions, so only with their bytes: {}; `dssmctl describe "
+                    "STREAM` before a recording gives a stream fields",
+                    list_text(names)));
+  }
+
   void notice(const std::string& text) {
     out_.clear_line();
     print_error(fmt::format("dssmctl: record: {}\n", text));
@@ -120,6 +156,8 @@ class RecordingRun {
   }
 
   const RecordOptions& options_;
+  Session session_;
+  const RecorderPlan& plan_;
   std::filesystem::path file_;
   Recorder& recorder_;
   RecordingFolder& folder_;
@@ -198,8 +236,8 @@ Result<void> run(const RecordOptions& options, Output& out) {
   RecordingWriter writer = DSSM_TRY(RecordingWriter::create(file, how));
   catch_stop_signals();
   const std::unique_ptr<Recorder> recorder =
-      DSSM_TRY(Recorder::start(std::move(session), std::move(writer), plan));
-  return RecordingRun(options, file, *recorder, folder, out).run();
+      DSSM_TRY(Recorder::start(session, std::move(writer), plan));
+  return RecordingRun(options, std::move(session), plan, file, *recorder, folder, out).run();
 }
 
 Result<void> prepare(RecordingFolder& folder) {

@@ -336,6 +336,24 @@ TEST_F(Record, InfoTakesNamesWithASlashForStreams) {
   EXPECT_TRUE(contains(output({"info", "robot/pose"}), "robot/pose"));
 }
 
+TEST_F(Record, NamesTheStreamsOfWhichItHasOnlyBytes) {
+  const auto pose = session_.create<RecordedPose>("pose", depth_of(4)).value();
+  const Finished all = ctl({"record", "--for", "1ms", "-o", file_});
+  EXPECT_EQ(all.exit_status, 0);
+  EXPECT_EQ(all.err, "");
+  output({"create", "scan", "--size", "8", "--depth", "4"});
+  output({"create", "spur", "--size", "8", "--depth", "4"});
+  const Finished bytes = ctl({"record", "--for", "1ms", "-o", folder_.file("b.mcap")});
+  EXPECT_EQ(bytes.exit_status, 0);
+  const auto lines = lines_of(bytes.err);
+  ASSERT_EQ(lines.size(), 1U) << bytes.err;
+  EXPECT_TRUE(contains(lines[0], "scan:0@pc1, spur:0@pc1")) << bytes.err;
+  EXPECT_FALSE(contains(lines[0], "pose")) << bytes.err;
+  EXPECT_TRUE(contains(lines[0], "`dssmctl describe STREAM`")) << bytes.err;
+  const Finished one = ctl({"record", "p*", "--for", "1ms", "-o", folder_.file("c.mcap")});
+  EXPECT_EQ(one.err, "");
+}
+
 // Folders and files that `record -o NAME` makes have names as streams have.
 TEST_F(Record, InfoTakesNamesOfRecordingsInTheWorkingDirectory) {
   const auto pose = session_.create<RecordedPose>("pose", depth_of(4)).value();
