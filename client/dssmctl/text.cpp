@@ -111,7 +111,7 @@ Error too_long(std::string_view text) { return bad(text, "is more than 292 years
 Error bad_moment(std::string_view text) {
   return bad(text,
              "is not a time: write seconds since 1970, such as 1700000000.25, ISO 8601, such as "
-             "2026-11-27T08:00:00Z, now, or -3s");
+             "2026-11-27T08:00:00Z, now, -3s, or, of a recording, +2s");
 }
 
 struct Unit {

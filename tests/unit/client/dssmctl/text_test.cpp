@@ -185,6 +185,8 @@ TEST(Text, ReadsMomentsInEveryForm) {
   EXPECT_EQ(parse_recorded_moment("+0.5", kNow)->after_start, 500ms);
   EXPECT_EQ(parse_recorded_moment("-3s", kNow)->back, -3s);
   EXPECT_EQ(parse_recorded_moment("1795766400", kNow)->time, kNow);
+  // Without a sign it may be meant from the beginning.
+  EXPECT_TRUE(parse_recorded_moment("2s", kNow).error().message.ends_with("+2s"));
   for (const char* text : {"+", "+-2s", "++2s", "+soon"}) {
     EXPECT_FALSE(parse_recorded_moment(text, kNow)) << text;
   }
