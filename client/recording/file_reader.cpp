@@ -363,10 +363,12 @@ void FileReader::scan() {
   }
   add_bare();
   if (!is_whole_) {
-    warn(
-        fmt::format("it has no end: it is still being written, or its writer was ended. {} bytes "
-                    "after the last whole record are left out",
-                    bytes_ - data_end_));
+    const std::uint64_t rest = bytes_ - data_end_;
+    warn(fmt::format("it has no end: it is still being written, or was cut off{}",
+                     rest == 0
+                         ? ""
+                         : fmt::format("; the last {} left out, after the last whole record",
+                                       rest == 1 ? "byte is" : fmt::format("{} bytes are", rest))));
   }
 }
 
