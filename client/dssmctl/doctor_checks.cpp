@@ -659,7 +659,8 @@ std::string odd_clock_text(const Facts& facts) {
                        list_text(agree));
   }
   if (agree.empty() && disagree.size() > 1) {
-    return fmt::format("the clocks of all others ({}) disagree with this PC's", list_text(disagree));
+    return fmt::format("the clocks of all others ({}) disagree with this PC's",
+                       list_text(disagree));
   }
   return "the two follow different clocks, or the network delays packets";
 }

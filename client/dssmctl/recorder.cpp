@@ -516,6 +516,7 @@ Result<void> Recorder::take_in_order(std::optional<Time> past_until, Time held_f
     std::ranges::pop_heap(turns_, kLaterLast);
     Turn& turn = turns_.back();
     Source& source = *turn.source;
+    if (turn.next == Time::max()) turn.next = next_time(source).value_or(Time::max());
     const bool is_known = turn.next != Time::max();
     const bool is_later = is_known && past_until && is_of_past(source) && turn.next > *past_until;
     const bool is_much = turn.bytes >= kTurnBytes;

@@ -21,9 +21,9 @@ inline constexpr char kPoseStream[] = "pose";
 // Stream "lidar". A sample's time is that of the scan. A sample without beams is the end mark: the
 // lidar has stopped, and readers may stop, too.
 struct Scan {
-  std::int32_t beams;  // how many of range_m are used
-  float first_rad;     // direction of range_m[0] from straight ahead, counter-clockwise
-  float step_rad;      // from each beam to the next
+  std::int32_t beams;        // how many of range_m are used
+  float first_rad;           // direction of range_m[0] from straight ahead, counter-clockwise
+  float step_rad;            // from each beam to the next
   float range_m[kMaxBeams];  // infinite without a reflection
 
   bool is_end() const { return beams == 0; }
