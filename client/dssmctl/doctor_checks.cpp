@@ -275,9 +275,9 @@ Advice clock_advice(const Facts& facts, const ClockSnapshot& clock, bool serves,
   switch (clock.reason) {
     case ClockReason::no_chronyd:
     case ClockReason::silent:
-      return {where + "chronyd is not running, hangs, or its cmdport is closed",
-              restart_chrony(facts) +
-                  (where.empty() ? "" : "  # or install it: sudo apt install chrony")};
+      return {where + (where.empty() ? "" : "chrony is not installed, or ") +
+                  "chronyd is not running, hangs, or its cmdport is closed",
+              restart_chrony(facts)};
     case ClockReason::unsynchronized:
       if (serves) {
         return {where +

@@ -58,8 +58,8 @@ Result<PlayedPart> played_part(const Recording& recording, const PlayOptions& op
                              time_text(whole.to, options.iso),
                              duration_text(saturating_sub(whole.to, whole.from)))};
   };
-  // An offset beyond the other end, as the last 10 s of a recording of 5 s, means that end. But a
-  // time outside of the recording is an error: the clocks would be set to it, and nothing played.
+  // The last 10 s of a recording of 5 s are all of it. But a time outside of the recording is an
+  // error: the clocks would be set to it, and nothing played.
   const auto moment = [&](const std::optional<Moment>& wanted, Time otherwise) {
     if (!wanted) return otherwise;
     if (wanted->back) return saturating_add(whole.to, *wanted->back);

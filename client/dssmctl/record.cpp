@@ -2,7 +2,6 @@
 //
 // dssmctl record: streams into an MCAP file, until Ctrl-C or a given time.
 #include <fmt/format.h>
-#include <fnmatch.h>
 
 #include <algorithm>
 #include <filesystem>
@@ -45,36 +44,12 @@ std::filesystem::path file_of(const RecordOptions& options) {
   return options.file;
 }
 
-bool is_planned(const StreamInfo& stream, const RecorderPlan& plan) {
-  const auto fits = [&](const std::string& type) {
-    return ::fnmatch(type.c_str(), stream.type.name.c_str(), 0) == 0;
-  };
-  return plan.filter.takes(stream.id) &&
-         (plan.types.empty() || std::ranges::any_of(plan.types, fits));
-}
-
-// Of those that are recorded and still there: the recording has only their bytes.
-std::vector<std::string> streams_without_fields(Session& session, const RecorderPlan& plan) {
-  std::vector<std::string> names;
-  const Result<std::vector<StreamInfo>> all = session.list_streams();
-  if (!all) return names;
-  for (const StreamInfo& stream : *all) {
-    if (!is_planned(stream, plan) || !stream.type.fields.empty()) continue;
-    // Lists leave out the fields of many types.
-    const Result<StreamInfo> info = session.stream_info(stream.id);
-    if (info && info->type.fields.empty()) names.push_back(stream.id.str());
-  }
-  return names;
-}
-
 // Records until it is to end, and says how it goes: on a terminal in a line that is redrawn.
 class RecordingRun {
  public:
-  RecordingRun(const RecordOptions& options, Session session, const RecorderPlan& plan,
-               std::filesystem::path file, Recorder& recorder, RecordingFolder& folder, Output& out)
+  RecordingRun(const RecordOptions& options, std::filesystem::path file, Recorder& recorder,
+               RecordingFolder& folder, Output& out)
       : options_(options),
-        session_(std::move(session)),
-        plan_(plan),
         file_(std::move(file)),
         recorder_(recorder),
         folder_(folder),
@@ -131,8 +106,7 @@ class RecordingRun {
   }
 
   void report_undescribed() {
-    if (recorder_.streams() == 0) return;
-    const std::vector<std::string> names = streams_without_fields(session_, plan_);
+    const std::vector<std::string> names = recorder_.streams_without_fields();
     if (names.empty()) return;
     notice(
         fmt::format("without descriptions, so only with their bytes: {}; `dssmctl describe "
@@ -156,8 +130,6 @@ class RecordingRun {
   }
 
   const RecordOptions& options_;
-  Session session_;
-  const RecorderPlan& plan_;
   std::filesystem::path file_;
   Recorder& recorder_;
   RecordingFolder& folder_;
@@ -236,8 +208,8 @@ Result<void> run(const RecordOptions& options, Output& out) {
   RecordingWriter writer = DSSM_TRY(RecordingWriter::create(file, how));
   catch_stop_signals();
   const std::unique_ptr<Recorder> recorder =
-      DSSM_TRY(Recorder::start(session, std::move(writer), plan));
-  return RecordingRun(options, std::move(session), plan, file, *recorder, folder, out).run();
+      DSSM_TRY(Recorder::start(std::move(session), std::move(writer), plan));
+  return RecordingRun(options, file, *recorder, folder, out).run();
 }
 
 Result<void> prepare(RecordingFolder& folder) {

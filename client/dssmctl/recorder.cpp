@@ -455,8 +455,14 @@ Result<void> Recorder::write_properties(Source& source, bool all) {
 
 std::optional<Time> Recorder::next_time(const Source& source) {
   SampleInfo info;
-  const Tid next = std::max(source.reader.cursor() + 1, source.reader.oldest_tid());
-  if (source.reader.read_info(next, info) != ReadStatus::ok) return std::nullopt;
+  const RawReader& reader = source.reader;
+  Tid next = std::max(reader.cursor() + 1, reader.oldest_tid());
+  ReadStatus status = reader.read_info(next, info);
+  // A read goes over those that the network did not carry.
+  for (const Tid newest = reader.newest_tid(); status == ReadStatus::lost && next < newest;) {
+    status = reader.read_info(++next, info);
+  }
+  if (status != ReadStatus::ok) return std::nullopt;
   return info.time;
 }
 
@@ -540,7 +546,7 @@ bool Recorder::is_held(const Turn& turn, Time held_from) {
   if (turn.next <= held_from || turn.next - held_from > 2 * kHeldFor) return false;
   const RawReader& reader = turn.source->reader;
   const auto waiting = static_cast<double>(reader.newest_tid() - reader.cursor());
-  return waiting <= kFilled * static_cast<double>(reader.depth() - 1);
+  return waiting <= kMaxHeld * static_cast<double>(reader.depth() - 1);
 }
 
 Result<bool> Recorder::take_next(Turn& turn) {
@@ -596,6 +602,14 @@ bool Recorder::has_past() const {
     return status == ReadStatus::lost || status == ReadStatus::too_old;
   };
   return opener_.has_tried_all() && std::all_of(sources_.begin(), sources_.end(), is_taken);
+}
+
+std::vector<std::string> Recorder::streams_without_fields() const {
+  std::vector<std::string> names;
+  for (const Source& source : sources_) {
+    if (source.reader.type().fields.empty()) names.push_back(source.reader.id().str());
+  }
+  return names;
 }
 
 std::vector<std::string> Recorder::take_notices() { return opener_.take_notices(); }

@@ -84,6 +84,8 @@ class Recorder {
   bool is_past_late();
 
   std::size_t streams() const { return sources_.size(); }
+  // Those whose description has no fields: of them the file has only bytes.
+  std::vector<std::string> streams_without_fields() const;
   // Of the file, or of the last one; there was one.
   RecordingProgress progress() const { return file_->progress(); }
   // Why streams are not recorded, for people; each only once.
@@ -114,6 +116,8 @@ class Recorder {
   // So long samples wait in their rings for earlier ones of other streams, which were measured or
   // sent before they were written: recorded in the order of times, they are played as they were.
   static constexpr Duration kHeldFor = std::chrono::milliseconds(100);
+  // And so much of a ring.
+  static constexpr double kMaxHeld = 0.1;
   // What one stream may have taken before the others have their turn.
   static constexpr std::uint64_t kTurnBytes = 4U << 20;
   // So long a property waits for its first sample, whose time is its own in the file.

@@ -54,34 +54,37 @@ void Events::find_of_hosts(const std::vector<HostInfo>& hosts, bool is_first) {
 }
 
 void Events::find_of_streams(const std::vector<StreamInfo>& streams, bool is_first) {
-  std::map<std::string, StreamState> new_streams;
+  std::map<std::string, Known> new_streams;
   for (const StreamInfo& stream : streams) {
     if (ctl::is_of_black_box(stream.id)) continue;
     const std::string name = stream.id.str();
     const auto known = streams_.find(name);
     // Of a host that does not answer just now, nothing is known; then the last state counts.
     const bool is_unknown = stream.state == StreamState::unknown && known != streams_.end();
-    new_streams[name] = is_unknown ? known->second : stream.state;
+    new_streams[name] = {is_unknown ? known->second.state : stream.state, false};
     if (is_first) continue;
     if (known == streams_.end()) {
       add(false, fmt::format("stream {} was created", name));
       continue;
     }
-    if (ctl::is_silent(stream) && known->second == StreamState::live) {
+    const StreamState before = known->second.state;
+    if (ctl::is_silent(stream) && before == StreamState::live) {
       add(true, fmt::format("stream {}: {}", name, name_of(stream.state)));
     } else if (stream.state == StreamState::live &&
-               (known->second == StreamState::stalled || known->second == StreamState::no_writer)) {
+               (before == StreamState::stalled || before == StreamState::no_writer)) {
       add(false, fmt::format("stream {} is live again", name));
     }
   }
-  for (const auto& [name, state] : streams_) {
+  for (const auto& [name, known] : streams_) {
     if (new_streams.contains(name)) continue;
-    // The streams of a host that is down are not listed, but may be there still.
+    // The streams of a host that is down are not listed, but may be there still; those of a host
+    // that has just come are listed a little later.
     const auto host = hosts_.find(StreamId::parse(name)->host);
-    if (host != hosts_.end() && !ctl::is_up(host->second.first)) {
-      new_streams[name] = state;
-    } else {
+    const bool is_up = host != hosts_.end() && ctl::is_up(host->second.first);
+    if (is_up && known.is_missing) {
       add(false, fmt::format("stream {} is gone", name));
+    } else {
+      new_streams[name] = {known.state, is_up};
     }
   }
   streams_ = std::move(new_streams);

@@ -31,12 +31,17 @@ class Events {
  private:
   static constexpr std::size_t kMaxEvents = 200;
 
+  struct Known {
+    StreamState state = StreamState::unknown;
+    bool is_missing = false;  // it was not listed at the last call, although its host was up
+  };
+
   void find_of_hosts(const std::vector<HostInfo>& hosts, bool is_first);
   void find_of_streams(const std::vector<StreamInfo>& streams, bool is_first);
 
   bool has_state_ = false;
   std::map<std::string, std::pair<HostState, bool>> hosts_;  // and whether its clock is refused
-  std::map<std::string, StreamState> streams_;
+  std::map<std::string, Known> streams_;
   std::deque<ctl::Json> events_;
   std::uint64_t last_event_ = 0;
 };

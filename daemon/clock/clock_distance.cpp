@@ -68,18 +68,21 @@ void StatedBounds::add(Time now, Duration bound) {
   stated_.back().bound = std::max(stated_.back().bound, bound);
   const Time needed = std::min(unbroken_from_, now - kMinute);
   while (stated_.front().wall < needed) stated_.pop_front();
-  if (stated_.size() > kMaxSteps) thin();
+  if (stated_.size() > kMaxSteps) thin(now);
 }
 
-// Joins each two of the older half, which is more than a minute old.
-void StatedBounds::thin() {
-  std::deque<StatedBound> thinned;
-  const std::size_t half = stated_.size() / 4 * 2;
-  for (std::size_t i = 0; i < half; i += 2) {
-    thinned.push_back({stated_[i].wall, std::max(stated_[i].bound, stated_[i + 1].bound)});
+// Joins the two steps before the last minute that are the shortest for their age.
+void StatedBounds::thin(Time now) {
+  std::size_t shortest = 0;
+  double least = 1;
+  for (std::size_t i = 0; i + 2 < stated_.size() && stated_[i + 1].wall < now - kMinute; ++i) {
+    const auto length = static_cast<double>(to_ns(stated_[i + 2].wall - stated_[i].wall));
+    const double part = length / static_cast<double>(to_ns(now - stated_[i].wall));
+    if (part < least) least = part, shortest = i;
   }
-  thinned.insert(thinned.end(), stated_.begin() + static_cast<std::ptrdiff_t>(half), stated_.end());
-  stated_ = std::move(thinned);
+  StatedBound& joined = stated_[shortest];
+  joined.bound = std::max(joined.bound, stated_[shortest + 1].bound);
+  stated_.erase(stated_.begin() + static_cast<std::ptrdiff_t>(shortest + 1));
 }
 
 PastBounds StatedBounds::past(Duration latest, Time now, Duration limit) const noexcept {

@@ -50,7 +50,7 @@ std::optional<WallDifference> wall_difference(const PairMeasurement::Difference&
 
 // A bound on a distance that was stated from `wall` on, until the next one.
 struct StatedBound {
-  Time wall;  // and of the times until the next one
+  Time wall;  // the bound holds from here on until the next one
   Duration bound;
 };
 
@@ -85,7 +85,7 @@ class StatedBounds {
   PastBounds past(Duration latest, Time now, Duration limit) const noexcept;
 
  private:
-  void thin();
+  void thin(Time now);
 
   std::deque<StatedBound> stated_;
   Time unbroken_from_{};

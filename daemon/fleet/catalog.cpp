@@ -52,17 +52,17 @@ void Catalog::host_down(const wire::HostId& id, const Error& error) {
   KnownHost& host = down_.emplace_back(std::move(removed.mapped()));
   host.is_down = true;
   notify([&](CatalogObserver& observer) { observer.on_host_down(host, error); });
-  tell_some();
+  report_removed();
 }
 
-bool Catalog::tell_some() {
-  for (int told = 0; !down_.empty(); ++told) {
+bool Catalog::report_removed() {
+  for (int reported = 0; !down_.empty(); ++reported) {
     KnownHost& host = down_.front();
     if (host.streams.empty()) {
       down_.pop_front();
       continue;
     }
-    if (told >= kRemovedPerTurn) return true;
+    if (reported >= kRemovedPerTurn) return true;
     const auto removed = host.streams.extract(host.streams.begin());
     // The host may be up again: then this one was reported as added, or will be.
     if (has(removed.mapped().id)) continue;

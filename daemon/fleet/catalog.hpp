@@ -49,6 +49,7 @@ class CatalogObserver {
   virtual void on_remote_stream_added(const KnownHost&, const StreamInfo&) {}
   // Another property, or none, from the sample after `stream.newest` on.
   virtual void on_remote_property_set(const StreamInfo& /*stream*/) {}
+  // Of a host that is down: maybe after it is up again, and not if it has the stream again.
   virtual void on_remote_stream_removed(const KnownHost&, const StreamInfo&) {}
 
  protected:
@@ -72,15 +73,14 @@ class Catalog {
   // --- updated by discovery
 
   // The host answers. When it is known already by another address, the first one stays; a host that
-  // comes with another instance id has restarted: it is reported as down first, with all its
-  // streams.
+  // comes with another instance id has restarted: it is reported as down first.
   void host_up(const wire::Greeting& greeting, const wire::Address& address);
-  // It does not answer any more: it and its streams are not in the catalog any more, and observers
-  // are told of each: of kRemovedPerTurn streams now, of the others by tell_some().
+  // It does not answer any more: it and its streams leave the catalog. Reports the host, and the
+  // removal of its first kRemovedPerTurn streams; report_removed() reports the others.
   void host_down(const wire::HostId& id, const Error& error);
-  // After host_up() and host_down(): tells of some of those that are left.
+  // After host_up() and host_down(): reports some of those that are left.
   //   returns  whether there are more: to be called again, in another turn of the loop
-  bool tell_some();
+  bool report_removed();
   // A stream is there, has a new ring, or is described. Its id names the owner's host. Descriptions
   // of fields are left out when a host has too many of them; what changes with each sample is not
   // kept.
@@ -118,7 +118,7 @@ class Catalog {
 
   std::string own_host_;
   std::map<wire::HostId, KnownHost> hosts_;
-  std::deque<KnownHost> down_;  // with streams whose removal is still to be told
+  std::deque<KnownHost> down_;  // with streams whose removal is still to be reported
   std::vector<CatalogObserver*> observers_;
 };
 

@@ -48,8 +48,8 @@ Peers::Peers(const EventLoop& loop, Resolver& resolver, const std::vector<wire::
       startup_is_over_(peers.empty()),
       startup_timer_(EventSource::timer(loop, [this] { end_startup(); })),
       reconcile_soon_(EventSource::timer(loop, [this] { reconcile(); })),
-      tell_removed_(EventSource::timer(loop, [this] {
-        if (catalog_.tell_some()) tell_removed_.enable_in(Duration::zero());
+      report_removed_(EventSource::timer(loop, [this] {
+        if (catalog_.report_removed()) report_removed_.enable_in(Duration::zero());
       })) {
   if (!startup_is_over_) startup_timer_.enable_in(kStartupTime);
   for (const wire::Address& peer : peers) peers_.emplace_back().connection = dial(peer);
@@ -351,7 +351,7 @@ void Peers::start_use(Peer& peer) {
   }
   const Result<wire::Address> address = wire::Address::parse(connection.address());
   catalog_.host_up(them, address ? *address : connection.configured());
-  tell_removed_.enable_in(Duration::zero());
+  report_removed_.enable_in(Duration::zero());
   connection.watch();
 }
 
@@ -365,7 +365,7 @@ void Peers::on_peer_down(PeerConnection& connection, const Error& error, bool at
     logger_.notice(fmt::format("host '{}' is down: {}", connection.them()->host, error.message),
                    {.peer = connection.them()->host, .message_id = message_id::kHostDown});
     catalog_.host_down(id, error);
-    tell_removed_.enable_in(Duration::zero());
+    report_removed_.enable_in(Duration::zero());
     take_over(id);
   } else if (attempt && !peer.logged_down) {
     const std::string who = peer.is_configured()

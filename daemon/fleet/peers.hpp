@@ -155,7 +155,7 @@ class Peers final : public HostFinderObserver, private PeerConnection::Observer 
   // Connections end, and those to found hosts begin, only in reconcile(): never within a call of
   // another one.
   EventSource reconcile_soon_;
-  EventSource tell_removed_;  // the catalog's observers, of many streams of hosts that are down
+  EventSource report_removed_;  // of many streams of hosts that are down
 };
 
 }  // namespace dssm::daemon

@@ -6,6 +6,7 @@ fields, and arrays whose elements are neither adjacent nor parts of structs.
 """
 
 import dataclasses
+import math
 import numbers
 import re
 import typing
@@ -427,9 +428,13 @@ def _fitting_objects(given: np.ndarray, base: np.dtype, path: str) -> np.ndarray
             result[index] = int(value)  # type: ignore[call-overload]
         else:
             try:
-                result[index] = _fitting(float(value), base, (), inner)  # type: ignore[arg-type]
+                number = float(value)  # type: ignore[arg-type]
             except OverflowError:
                 raise _does_not_fit(value, base, inner) from None
+            # Of a Decimal that is too large, Python makes an infinite float.
+            if math.isinf(number) and number != value:
+                raise _does_not_fit(value, base, inner)
+            result[index] = _fitting(number, base, (), inner)
     return result
 
 

@@ -315,8 +315,7 @@ def oldest_live(page, stream):
     first = int(page.get("#time", "data-oldest-ns"))
     page.wait("the ring goes on", lambda: int(page.get("#time", "data-oldest-ns")) > first)
     page.press(Keys.HOME)
-    t = int(settled(page, [stream]))
-    assert t < int(page.get("#time", "data-oldest-ns")) + 2 * 10**9
+    settled(page, [stream])
     page.press("l")
     page.wait("live", lambda: page.get("#time", "data-mode") == "live")
     page.press("r")

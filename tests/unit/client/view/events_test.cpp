@@ -47,7 +47,7 @@ class EventsTest : public testing::Test {
   int last_ = 0;
 };
 
-TEST_F(EventsTest, TellOfStreams) {
+TEST_F(EventsTest, NameStreams) {
   streams_[0].state = StreamState::stalled;
   EXPECT_EQ(found(), "warn: stream lamp:0@pc1: stalled\n");
   EXPECT_EQ(found(), "");
@@ -58,10 +58,12 @@ TEST_F(EventsTest, TellOfStreams) {
   streams_.push_back(stream("camera:0@pc1"));
   EXPECT_EQ(found(), "info: stream camera:0@pc1 was created\n");
   streams_.pop_back();
+  EXPECT_EQ(found(), "") << "a list may lack it for a moment";
   EXPECT_EQ(found(), "info: stream camera:0@pc1 is gone\n");
+  EXPECT_EQ(found(), "");
 }
 
-TEST_F(EventsTest, TellOfClocksThatAreOutOfBounds) {
+TEST_F(EventsTest, NameClocksThatAreOutOfBounds) {
   hosts_[1].clock_refused = true;
   hosts_[1].clock_reason = "its chronyd follows no source";
   EXPECT_EQ(found(), "warn: the clock of pc2 is out of bounds: its chronyd follows no source\n");
@@ -71,7 +73,7 @@ TEST_F(EventsTest, TellOfClocksThatAreOutOfBounds) {
 }
 
 // Its streams are not listed meanwhile, but are not gone.
-TEST_F(EventsTest, TellOfAHostThatIsDown) {
+TEST_F(EventsTest, NameAHostThatIsDown) {
   const StreamInfo lidar = streams_[1];
   hosts_[1].state = HostState::down;
   hosts_[1].error = "connection refused";
@@ -82,7 +84,26 @@ TEST_F(EventsTest, TellOfAHostThatIsDown) {
   streams_.push_back(lidar);
   EXPECT_EQ(found(), "info: host pc2 is up\n");
   streams_.pop_back();
+  EXPECT_EQ(found(), "");
   EXPECT_EQ(found(), "info: stream lidar:0@pc2 is gone\n");
+}
+
+// Its streams are listed a little later than the host, or it is not listed any more.
+TEST_F(EventsTest, NameNoStreamsWhoseHostComesOrGoes) {
+  const StreamInfo lidar = streams_[1];
+  streams_.pop_back();
+  EXPECT_EQ(found(), "");
+  streams_.push_back(lidar);
+  EXPECT_EQ(found(), "");
+  const HostInfo pc2 = hosts_[1];
+  hosts_.pop_back();
+  streams_.pop_back();
+  EXPECT_EQ(found(), "warn: host pc2 is down: it is not known any more\n");
+  EXPECT_EQ(found(), "");
+  hosts_.push_back(pc2);
+  EXPECT_EQ(found(), "info: host pc2 is up\n");
+  streams_.push_back(lidar);
+  EXPECT_EQ(found(), "");
 }
 
 }  // namespace

@@ -1,4 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
+//
+// Bounds of the distance of two clocks, by their reports, and what is remembered of measured ones.
 #include "daemon/clock/clock_distance.hpp"
 
 #include <gtest/gtest.h>
@@ -172,6 +174,24 @@ TEST_F(PastBoundsTest, DoNotReachToWhereTheClocksWereComparedLessWell) {
   EXPECT_LE(past().from, kNow - 4min) << "in steps of some seconds";
   state_between(0s, -1s, 400us);
   EXPECT_EQ(past(400us).from, kNow - 10min);
+}
+
+TEST_F(PastBoundsTest, ReachToABusyMomentOfLongAgo) {
+  state_between(10h, 5h, 50us);
+  state(5h, 800us);
+  state_between(5h - 1s, 0s, 50us);
+  EXPECT_EQ(past().greatest, 50us);
+  EXPECT_GE(past().from, kNow - 5h);
+  EXPECT_LE(past().from, kNow - 4h);
+}
+
+TEST_F(PastBoundsTest, StayWhenTheClockIsSlewedBackwards) {
+  state_between(100s, 0s, 50us);
+  stated.add(kNow - 3s, 70us);
+  EXPECT_EQ(past().from, kNow - 100s);
+  EXPECT_EQ(past().greatest, 70us);
+  stated.clear();
+  EXPECT_EQ(past().from, kNow);
 }
 
 TEST_F(PastBoundsTest, DoNotReachOverATimeWithoutHeartbeats) {

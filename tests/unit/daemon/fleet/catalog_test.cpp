@@ -108,9 +108,9 @@ TEST(Catalog, ReportsManyStreamsOfAHostThatIsDownInTurns) {
   catalog.host_up(host("pc2", 2, 2), at("10.0.0.2"));
   ASSERT_TRUE(catalog.stream_added(id_of(2), stream(last, "pc2", 2)));
   EXPECT_EQ(recorder.take(), (Told{"up pc2", "+" + last + ":0@pc2"}));
-  EXPECT_TRUE(catalog.tell_some());
+  EXPECT_TRUE(catalog.report_removed());
   EXPECT_EQ(recorder.take().size(), std::size_t{Catalog::kRemovedPerTurn});
-  EXPECT_FALSE(catalog.tell_some());
+  EXPECT_FALSE(catalog.report_removed());
   EXPECT_EQ(recorder.take(), Told{}) << "it is there";
 }
 
