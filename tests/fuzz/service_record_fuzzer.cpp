@@ -17,7 +17,12 @@ void require(bool holds) {
   if (!holds) std::abort();
 }
 
+// No mDNS message is longer (RFC 6762 section 17). Of more, this itself would take much memory: 64
+// bytes and more for each empty string.
+constexpr std::size_t kMaxMessageBytes = 9000;
+
 TxtRecord txt_from(std::string_view bytes) {
+  bytes = bytes.substr(0, kMaxMessageBytes);
   TxtRecord txt;
   while (!bytes.empty()) {
     const std::size_t length = static_cast<unsigned char>(bytes.front());
