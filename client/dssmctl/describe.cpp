@@ -240,7 +240,8 @@ Duration behind_owner(const StreamInfo& stream) {
 
 std::string carried_text(const StreamInfo& stream) {
   if (!stream.mirror || stream.mirror->recent_lost_samples == 0) return {};
-  if (stream.mirror->state != MirrorState::live || stream.rate_hz <= 0) return {};  // as it was
+  // What was counted before the owner was down says nothing of the network now.
+  if (stream.mirror->state != MirrorState::live || stream.rate_hz <= 0) return {};
   const double share = 1 - static_cast<double>(stream.mirror->recent_lost_samples) /
                                static_cast<double>(stream.mirror->recent_samples);
   const double carried_hz = share * stream.rate_hz;

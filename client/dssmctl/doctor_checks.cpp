@@ -646,17 +646,17 @@ bool has_clock_to_check(const HostInfo& host) {
   return is_other_pc(host) || !host.clock_reason.empty();
 }
 
-// Of a clock and this PC's, which are too far apart although each of them seems good: which of the
-// two disagrees with the others.
-std::string odd_clock_text(const Facts& facts) {
+// Why another PC's clock and this one's are too far apart although each of them seems good: one of
+// them may differ from all others.
+std::string disagreement_text(const Facts& facts) {
   std::vector<std::string> agree, disagree;
   for (const HostInfo& host : facts.hosts) {
     if (!has_clock_to_check(host)) continue;
     (host.clock_reason.empty() ? agree : disagree).push_back(name_of(host));
   }
   if (!agree.empty() && disagree.size() == 1) {
-    return fmt::format("the clock of {} is the odd one out: this PC's agrees with {}", disagree[0],
-                       list_text(agree));
+    return fmt::format("only the clock of {} disagrees with this PC's; these agree with it: {}",
+                       disagree[0], list_text(agree));
   }
   if (agree.empty() && disagree.size() > 1) {
     return fmt::format("the clocks of all others ({}) disagree with this PC's",
@@ -676,7 +676,7 @@ void check_fleet_clocks(const Facts& facts, Findings& findings) {
           fmt::format("reads of its samples by time are {}: {}",
                       host.clock_refused ? "refused" : "marked as bad", host.clock_reason);
       const std::optional<ClockSnapshot>& own = facts.hosts.front().clock;
-      Advice advice{odd_clock_text(facts),
+      Advice advice{disagreement_text(facts),
                     "chronyc sources  # here and there: both have to follow one reference"};
       if (host.clock && !is_good(*host.clock)) {
         advice = clock_advice(facts, *host.clock, !followers(facts, host).empty(),

@@ -30,7 +30,7 @@
 namespace dssm::ctl {
 namespace {
 
-// Of programs that poll instead.
+// What programs that poll have to call instead.
 constexpr std::string_view kWaysToWait =
     "a read that waits (in SSM: setBlocking(true) before readNext()), usleepSSM() or "
     "PlaybackClock::sleep_until(), in place of usleep()";

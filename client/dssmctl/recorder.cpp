@@ -458,7 +458,7 @@ std::optional<Time> Recorder::next_time(const Source& source) {
   const RawReader& reader = source.reader;
   Tid next = std::max(reader.cursor() + 1, reader.oldest_tid());
   ReadStatus status = reader.read_info(next, info);
-  // A read goes over those that the network did not carry.
+  // Reads skip those that the network did not carry.
   for (const Tid newest = reader.newest_tid(); status == ReadStatus::lost && next < newest;) {
     status = reader.read_info(++next, info);
   }
@@ -540,8 +540,7 @@ Result<void> Recorder::take_in_order(std::optional<Time> past_until, Time held_f
   return {};
 }
 
-// Not when too little of its ring is left for those that come meanwhile; nor samples with stamps of
-// another time.
+// Samples do not wait if they take too much of their ring, or if their times are not of now.
 bool Recorder::is_held(const Turn& turn, Time held_from) {
   if (turn.next <= held_from || turn.next - held_from > 2 * kHeldFor) return false;
   const RawReader& reader = turn.source->reader;

@@ -113,10 +113,10 @@ class Recorder {
   // The past is recorded in parts of this length, each of all streams, so that the recording is
   // about in the order of times.
   static constexpr Duration kPastPart = std::chrono::milliseconds(100);
-  // So long samples wait in their rings for earlier ones of other streams, which were measured or
-  // sent before they were written: recorded in the order of times, they are played as they were.
+  // So long a sample waits in its ring, because one with an earlier time may still come: a sensor
+  // needs time to measure, and the network to send. So the recording is in the order of times.
   static constexpr Duration kHeldFor = std::chrono::milliseconds(100);
-  // And so much of a ring.
+  // The part of a ring that samples which wait may take.
   static constexpr double kMaxHeld = 0.1;
   // What one stream may have taken before the others have their turn.
   static constexpr std::uint64_t kTurnBytes = 4U << 20;

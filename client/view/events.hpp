@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What has happened on the vehicle since dssm-view was started, from how hosts and streams differ
-// from one look at them to the next.
+// What has happened on the vehicle since dssm-view was started, from how the lists of hosts and
+// streams differ from one second to the next.
 #pragma once
 
 #include <cstdint>

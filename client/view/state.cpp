@@ -217,7 +217,6 @@ Result<void> StateCollector::collect(bool all) {
   json["version"] = daemon.version;
   json["streams"] = streams_json(state_.streams);
   find_oldest(all);
-  show_oldest(state_);
   json["hosts"] = Json::array();
   for (const HostInfo& host : hosts) {
     // Another address of a host that is there already.

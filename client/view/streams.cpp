@@ -216,8 +216,8 @@ void Streams::close_unused() {
   });
   // The fields that were found remain known, also when no program has the stream open then.
   std::erase_if(descriptions_, [&](const auto& named) {
-    const bool is_worth = !named.second.type.fields.empty() && descriptions_.size() <= kMaxStreams;
-    return !entries_.contains(named.first) && !is_worth;
+    const bool is_kept = !named.second.type.fields.empty() && descriptions_.size() <= kMaxStreams;
+    return !entries_.contains(named.first) && !is_kept;
   });
 }
 

@@ -65,12 +65,13 @@ struct PastBounds {
   Time recent_from;
 };
 
-// What was stated of two clocks, as long as they are compared each second: of the last minute each
-// second, before that in longer steps, the longer ago it is. Times are by this PC's wall clock.
+// The bounds on the distance of two clocks that were stated while they were compared: one for each
+// second of the last minute, and one for each longer step before that. Times are by this PC's wall
+// clock.
 class StatedBounds {
  public:
   static constexpr Duration kMinute = std::chrono::seconds(60);
-  // Clocks that were not compared for longer: what was stated before counts for a minute.
+  // When the clocks were not compared for longer, what was stated before counts for a minute only.
   static constexpr Duration kMaxGap = std::chrono::seconds(5);
   static constexpr std::size_t kMaxSteps = 256;
 
@@ -78,9 +79,9 @@ class StatedBounds {
   void clear() { stated_.clear(); }
   bool empty() const noexcept { return stated_.empty(); }
 
-  // Of the last minute as far back as all was within the limit. What was stated before that is
-  // included as far back as it is at most twice as great, or a tenth of the limit: the samples of
-  // the last minute are not to count by a busy hour.
+  // Of the last minute: as far back as all bounds were within the limit. Of the time before: as far
+  // back as they were at most twice as great as in that minute, or a tenth of the limit. So a busy
+  // hour does not make the bound of the last minute's samples much greater.
   //   latest  the bound at `now`, which may be beyond the limit
   PastBounds past(Duration latest, Time now, Duration limit) const noexcept;
 

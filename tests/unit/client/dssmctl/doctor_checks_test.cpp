@@ -456,7 +456,7 @@ TEST(Doctor, NamesTheClockThatDisagreesWithTheOthers) {
             "the clocks of all others (pc2, pc3) disagree with this PC's");
   facts.hosts[2].clock_reason.clear();
   EXPECT_EQ(finding_of(facts, "clock of pc2").cause,
-            "the clock of pc2 is the odd one out: this PC's agrees with pc3");
+            "only the clock of pc2 disagrees with this PC's; these agree with it: pc3");
 }
 
 TEST(Doctor, FindsHostsOfOneName) {
