@@ -18,7 +18,9 @@ void ConnectPlan::begin_round(std::vector<wire::SocketAddress> addresses) {
 }
 
 Duration ConnectPlan::connect_timeout() const noexcept {
-  return std::min(kConnectTimeout, round_time_ / static_cast<std::int64_t>(addresses_.size()));
+  const Duration timeout =
+      is_recent_ && round_ % kPatientRound != 0 ? kRecentTimeout : kConnectTimeout;
+  return std::min(timeout, round_time_ / static_cast<std::int64_t>(addresses_.size()));
 }
 
 std::string ConnectPlan::no_answer_text() const {
@@ -37,8 +39,16 @@ Duration ConnectPlan::end_round(MonoTime now, bool avoid_address) {
   avoided_ = avoid_address ? address().str() : std::string();
   // One that greets and then refuses is not connected to a hundred times a second.
   const auto up_since = std::exchange(up_since_, std::nullopt);
-  if (up_since && now - *up_since >= kUsefulTime) pause_ = kFirstPause;
-  return std::exchange(pause_, std::min(2 * pause_, kMaxPause));
+  if (up_since && now - *up_since >= kUsefulTime) {
+    pause_ = kFirstPause;
+    lost_at_ = now;
+    round_ = 0;
+  }
+  ++round_;
+  is_recent_ = lost_at_ && now - *lost_at_ < kRecentTime;
+  const Duration pause = std::min(pause_, is_recent_ ? kRecentPause : kMaxPause);
+  pause_ = std::min(2 * pause_, kMaxPause);
+  return pause;
 }
 
 }  // namespace dssm::channel

@@ -8,6 +8,9 @@
 //           the connection was given up, the next round begins with the address after it
 //   pause   between rounds, from kFirstPause on, doubled each time, up to kMaxPause. It starts
 //           again with kFirstPause after a connection that was useful
+//   recent  for kRecentTime after such a connection, attempts and pauses are short. What took it
+//           away, as a cut cable or a restart, is usually soon over, and the kernel repeats a first
+//           packet that was lost only after 1 s
 #pragma once
 
 #include <dssm/result.hpp>
@@ -27,6 +30,11 @@ class ConnectPlan {
   static constexpr Duration kMaxPause = std::chrono::seconds(1);
   // For one address: longer than the kernel takes to repeat a lost first packet (1 s).
   static constexpr Duration kConnectTimeout = std::chrono::seconds(2);
+  static constexpr Duration kRecentTime = std::chrono::minutes(1);
+  static constexpr Duration kRecentPause = std::chrono::milliseconds(100);    // at most
+  static constexpr Duration kRecentTimeout = std::chrono::milliseconds(200);  // for one address
+  // One in so many rounds has kConnectTimeout then, too: the network may have become slow.
+  static constexpr int kPatientRound = 8;
   // A connection that was up for so long was useful.
   static constexpr Duration kUsefulTime = std::chrono::seconds(2);
 
@@ -61,7 +69,10 @@ class ConnectPlan {
   std::size_t current_ = 0;
   std::string avoided_;  // the address to try last; empty: none
   std::optional<MonoTime> up_since_;
-  Duration pause_ = kFirstPause;  // the next one
+  std::optional<MonoTime> lost_at_;  // when the last useful connection ended
+  bool is_recent_ = false;           // that was less than kRecentTime ago
+  int round_ = 0;                    // since then
+  Duration pause_ = kFirstPause;     // the next one
 };
 
 }  // namespace dssm::channel

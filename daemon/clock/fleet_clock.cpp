@@ -15,6 +15,7 @@
 #include <cstring>
 #include <utility>
 
+#include "core/base/text.hpp"
 #include "core/base/time.hpp"
 #include "core/clock/clock_bound.hpp"
 
@@ -51,6 +52,14 @@ std::vector<wire::IpAddress> own_addresses() {
 std::uint32_t ppb(clock::PartsPerBillion ageing) noexcept {
   return static_cast<std::uint32_t>(
       std::clamp<clock::PartsPerBillion>(ageing, 0, ring::ClockAssessment::kMaxAgeingPpb));
+}
+
+// For the log, after why a host's clock is not good here: whether it is the only one, or this PC's
+// clock may be the one that is wrong. good: the other hosts whose clocks are.
+std::string others_text(const std::vector<std::string>& good) {
+  if (good.empty()) return "; those of no other host are good here either";
+  if (good.size() == 1) return "; those of " + in_quotes(good[0]) + " are good";
+  return fmt::format("; those of {} other hosts are good", good.size());
 }
 
 // "out of bounds (stepped)"
@@ -346,10 +355,17 @@ void FleetClock::update_line(RawTime now) {
 
 void FleetClock::log_others(MonoTime now) {
   if (policies_.general.policy == ClockPolicy::off) return;
+  std::map<wire::HostId, std::string> reasons;
+  std::vector<std::string> good;
   for (const auto& [id, host] : catalog_.hosts()) {
     if (id == self_) continue;
-    log_.update(id, host.greeting.host,
-                reason_against(host.greeting.clock.get(), policies_.general.limit), now);
+    std::string reason = reason_against(host.greeting.clock.get(), policies_.general.limit);
+    if (reason.empty()) good.push_back(host.greeting.host);
+    reasons.emplace(id, std::move(reason));
+  }
+  for (auto& [id, reason] : reasons) {
+    if (!reason.empty() && reasons.size() > 1) reason += others_text(good);
+    log_.update(id, catalog_.find(id)->greeting.host, reason, now);
   }
 }
 

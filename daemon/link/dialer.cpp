@@ -26,14 +26,17 @@ Dialer::Dialer(const EventLoop& loop, Resolver& resolver, Options options, Obser
 
 // --- for the user
 
-void Dialer::retry_now() {
+void Dialer::retry_now(Duration patience) {
+  stopped_ = false;
   plan_.reset_pause();
   if (state_ == State::pause) timer_.enable_in(Duration::zero());
+  if (state_ == State::connect && loop_.now() - round_began_ >= patience) begin_round_soon();
 }
 
-void Dialer::on_network_changed() {
-  retry_now();
-  if (state_ == State::connect && loop_.now() - round_began_ >= kMinRound) begin_round_soon();
+void Dialer::stop(const Error& why) {
+  stopped_ = true;
+  if (state_ == State::pause) timer_.disable();
+  restart(why);
 }
 
 void Dialer::restart(const Error& why) {
@@ -237,7 +240,8 @@ void Dialer::fail(const Error& why) {
   const bool avoid_address =
       std::exchange(given_up_, false) || state_ == State::greet || state_ == State::secure;
   state_ = State::pause;
-  timer_.enable_in(plan_.end_round(loop_.now(), avoid_address));
+  const Duration pause = plan_.end_round(loop_.now(), avoid_address);
+  if (!stopped_) timer_.enable_in(pause);
   observer_.on_down(why);
 }
 

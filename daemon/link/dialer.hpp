@@ -61,15 +61,16 @@ class Dialer final : private FrameConnection::Observer {
   Dialer(const Dialer&) = delete;
   Dialer& operator=(const Dialer&) = delete;
 
-  // Ends the pause: the other side may just have become available.
-  void retry_now();
-  // Ends the pause, or a round of attempts that began more than kMinRound ago, and begins the next
-  // one: the kernel repeats a lost first packet only after a second.
-  void on_network_changed();
+  // Ends the pause, or what stop() began: the other side may just have become available. So it ends
+  // a round of attempts that waits for an answer for `patience` or longer: the kernel repeats a lost
+  // first packet only after a second.
+  void retry_now(Duration patience = Duration::max());
   static constexpr Duration kMinRound = std::chrono::milliseconds(500);
   // Gives up the connection or the attempt that is under way: on_down() follows from the loop, then
   // the next attempt after the pause that is due. During a pause: nothing.
   void restart(const Error& why);
+  // The same, but the next attempt comes only after retry_now().
+  void stop(const Error& why);
   // The addresses from the next round of attempts on. That begins at once when an attempt waits for
   // an answer; a connection that is up stays as it is.
   void set_addresses(std::vector<wire::Address> addresses);
@@ -135,6 +136,7 @@ class Dialer final : private FrameConnection::Observer {
   std::optional<wire::Greeting> them_;
   std::optional<Error> reason_;  // why the connection is about to close, if known here
   bool given_up_ = false;        // by restart(), while it was up
+  bool stopped_ = false;         // by stop()
   EventSource connected_, timer_;
 };
 

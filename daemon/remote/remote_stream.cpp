@@ -35,7 +35,7 @@ void OwnerConnection::connect(const KnownHost& host) {
 }
 
 void OwnerConnection::on_owner_down(const Error& why) {
-  if (dialer_) dialer_->restart(why);
+  if (dialer_) dialer_->stop(why);
 }
 
 void OwnerConnection::reopen() {

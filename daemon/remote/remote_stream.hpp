@@ -82,7 +82,7 @@ struct ChannelParts {
 
 // The connection of a mirror or a remote writer to the dssmd that owns its stream: follows the host
 // to the address that the catalog knows, checks that it is this host that answers, and always
-// reconnects.
+// reconnects while that host is up.
 class OwnerConnection final : private Dialer::Observer {
  public:
   // Between two attempts to open a stream that was removed or refused.
@@ -103,7 +103,8 @@ class OwnerConnection final : private Dialer::Observer {
 
   // The owner answers at that address. Another host than before has taken over the name.
   void connect(const KnownHost& host);
-  // The owner does not answer: this connection has ended too, even if TCP has not noticed it.
+  // The owner does not answer: this connection has ended too, even if TCP has not noticed it. No
+  // attempts until connect(): the control connection finds out when the owner is back.
   void on_owner_down(const Error& why);
 
   // Opens the stream again, on a new connection: the present one belongs to a stream that was

@@ -162,18 +162,25 @@ void measure_link(test::Network& network, const Hosts& hosts, int megabytes_per_
     const double link_ns = static_cast<double>(kFrameBytes) * 1e3 / megabytes_per_s;
     print_ages("just after opening" + tail, raw, watch(kWatched, newest), link_ns);
     print_ages("later" + tail, raw, watch(kWatched, newest), link_ns);
+    const auto print_first = [&](const std::string& after) {
+      SampleInfo before, info;
+      static_cast<void>(reader.read_newest(frame, before));
+      const std::int64_t healed = now_ns();
+      do {
+        sleep_until(MonoClock::now() + kPoll);
+        static_cast<void>(reader.read_newest(frame, info));
+      } while (info.tid == before.tid);
+      std::printf("%-44s %9.1f\n", ("  the first after a " + after + tail).c_str(),
+                  static_cast<double>(now_ns() - healed) / 1e6);
+    };
+    network.block(2);
+    std::this_thread::sleep_for(kCut);
+    network.unblock(2);
+    print_first("cut far away");
     network.cut(2);
     std::this_thread::sleep_for(kCut);
     network.heal(2);
-    SampleInfo before, info;
-    static_cast<void>(reader.read_newest(frame, before));
-    const std::int64_t healed = now_ns();
-    do {
-      sleep_until(MonoClock::now() + kPoll);
-      static_cast<void>(reader.read_newest(frame, info));
-    } while (info.tid == before.tid);
-    std::printf("%-44s %9.1f\n", ("  the first after a cut" + tail).c_str(),
-                static_cast<double>(now_ns() - healed) / 1e6);
+    print_first("cut");
     print_ages("from then on" + tail, raw, watch(kWatched, newest), link_ns);
   }
   end_child(writer);

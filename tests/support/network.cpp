@@ -154,6 +154,16 @@ void Network::heal(int host) {
   ip("link set " + name(host) + " up\n");
 }
 
+void Network::block(int host) {
+  const Inside inside(switch_.get());
+  ip("link set " + name(host) + " type bridge_slave state 0\n");  // BR_STATE_DISABLED
+}
+
+void Network::unblock(int host) {
+  const Inside inside(switch_.get());
+  ip("link set " + name(host) + " type bridge_slave state 3\n");  // BR_STATE_FORWARDING
+}
+
 Result<void> Network::shape(int host, const std::string& how) {
   const Inside inside(switch_.get());
   // tc reads commands like ip.

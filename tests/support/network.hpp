@@ -66,6 +66,9 @@ class Network {
   // Disconnect and reconnect the host's cable at the switch; no effect if already done.
   void cut(int host);
   void heal(int host);
+  // The same further away, as when Wi-Fi is out of reach: the host's interface stays connected.
+  void block(int host);
+  void unblock(int host);
 
   // Shapes what the switch sends to the host, as in tc-netem(8) or tc-tbf(8): "netem delay 20ms",
   // "tbf rate 20mbit burst 64kb latency 100ms".

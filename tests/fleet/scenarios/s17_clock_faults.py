@@ -116,6 +116,7 @@ def faults_of(guest: Guest, order: random.Random) -> Iterator[Fault]:
     if is_reference:
         yield "returns with a wrong time", returns_with_wrong_time(guest), False
         yield "restarted with a wrong time", restarted_with_wrong_time(guest), True
+        yield "and all others without chronyd", without_chronyd, True
 
 
 def step(guest: Guest, ns: int) -> Callable[[Lab, Truth], None]:
@@ -205,11 +206,25 @@ def overloaded(guest: Guest) -> Callable[[Lab, Truth], None]:
     def happen(_lab: Lab, truth: Truth) -> None:
         began = time.monotonic_ns()
         guest.ssh.run("for i in 1 2 3 4; do (while :; do :; done) & all=\"$all $!\"; done; sleep 15; kill $all")
-        shares = {(reader, owner): truth.share_good(reader, owner, began)
-                  for reader in truth.watched for owner in truth.watched if reader != owner}
-        assert min(shares.values()) == 1, f"samples were refused because {guest.name} was busy: {shares}"
+        expect_all_good(truth, began, f"{guest.name} was busy")
 
     return happen
+
+
+def expect_all_good(truth: Truth, began: int, what: str) -> None:
+    """All PCs accepted all samples since then."""
+    shares = {(reader, owner): truth.share_good(reader, owner, began)
+              for reader in truth.watched for owner in truth.watched if reader != owner}
+    assert min(shares.values()) == 1, f"samples were refused because {what}: {shares}"
+
+
+def without_chronyd(lab: Lab, truth: Truth) -> None:
+    """No PC runs chronyd: the heartbeats alone decide."""
+    began = time.monotonic_ns()
+    lab.on_all(lambda guest: guest.ssh.run("systemctl stop chrony"))
+    time.sleep(WATCHED_SECONDS)
+    lab.on_all(lambda guest: guest.ssh.run("systemctl start chrony"))
+    expect_all_good(truth, began, "no PC ran chronyd")
 
 
 def frozen(guest: Guest) -> Callable[[Lab, Truth], None]:

@@ -79,6 +79,34 @@ TEST(ConnectPlan, PausesShortlyOnlyAfterAConnectionThatWasUseful) {
   EXPECT_EQ(plan.end_round(now, false), ConnectPlan::kFirstPause);
 }
 
+TEST(ConnectPlan, TriesOftenForAWhileAfterAConnectionThatWasUseful) {
+  ConnectPlan plan;
+  plan.begin_round(addresses(1));
+  MonoTime now(100s);
+  plan.on_up(now);
+  const MonoTime lost = now += 1h;
+  plan.end_round(now, false);
+  int patient = 0;
+  while (true) {
+    plan.begin_round(addresses(1));
+    const Duration timeout = plan.connect_timeout();
+    EXPECT_TRUE(timeout == ConnectPlan::kRecentTimeout || timeout == ConnectPlan::kConnectTimeout);
+    if (timeout == ConnectPlan::kConnectTimeout) ++patient;
+    now += timeout;
+    const Duration pause = plan.end_round(now, false);
+    if (now - lost >= ConnectPlan::kRecentTime) {
+      EXPECT_EQ(pause, ConnectPlan::kMaxPause);
+      break;
+    }
+    EXPECT_LE(pause, ConnectPlan::kRecentPause);
+    now += pause;
+  }
+  // Eight rounds take 7 short timeouts, a long one and 8 pauses.
+  EXPECT_NEAR(patient, ConnectPlan::kRecentTime / 4200ms, 2);
+  plan.begin_round(addresses(1));
+  EXPECT_EQ(plan.connect_timeout(), ConnectPlan::kConnectTimeout);
+}
+
 TEST(ConnectPlan, LetsTheAddressesShareTheTimeOfARound) {
   ConnectPlan plan(2s);
   plan.begin_round(addresses(4));

@@ -670,6 +670,22 @@ TEST_F(MeasuredTest, StatesNoBoundWhereStatementsExcludeEachOther) {
   EXPECT_TRUE(contains(pair.reason, "the heartbeats show")) << pair.reason;
 }
 
+TEST_F(MeasuredTest, LogsWhichClockDisagreesWithTheOthers) {
+  add_reference();
+  start();
+  heartbeat(0us);
+  heartbeat_of_reference(0us);
+  wait([this] { return fleet->clock_pairs().size() == 2; });
+  heartbeat_of_reference(10ms);
+  wait([this] { return logger.contains("'pc1''s samples are not good here"); });
+  EXPECT_TRUE(logger.warnings.back().ends_with("; those of 'pc3' are good"))
+      << logger.warnings.back();
+  heartbeat(20ms);
+  wait([this] { return logger.contains("'pc3''s samples are not good here"); });
+  EXPECT_TRUE(logger.warnings.back().ends_with("; those of no other host are good here either"))
+      << logger.warnings.back();
+}
+
 TEST_F(FleetClockTest, StatesOneClockForAHostWithThisKernel) {
   start();
   wire::Greeting same = host(kOther, "pc2", kUnknownClockError);

@@ -208,16 +208,39 @@ TEST_F(DialerTest, LeavesAnAttemptThatWaitsForAnAnswerWhenTheNetworkChanged) {
   dial({"pc2", 1});
   wait([this] { return dialer->reached() == Dialer::Phase::connect; });
   answers = wire::resolve_number(owner.address());
-  dialer->on_network_changed();  // it has just begun
+  dialer->retry_now(Dialer::kMinRound);  // it has just begun
   bool is_old = false;
   EventSource timer = EventSource::timer(loop, [&] { is_old = true; });
   timer.enable_in(Dialer::kMinRound);
   wait([&] { return up || is_old; });
   EXPECT_FALSE(up);
-  dialer->on_network_changed();
+  dialer->retry_now(Dialer::kMinRound);
   // No timer runs here, so nothing times out. The name is resolved by a thread, in real time.
   while (!up) event_base_loop(loop.base(), EVLOOP_ONCE);
   EXPECT_TRUE(downs.empty());
+}
+
+TEST_F(DialerTest, TriesNoMoreAfterAStopUntilItIsAsked) {
+  ScriptedHost owner(loop);
+  dial(owner.address());
+  wait([this] { return up; });
+  const auto is_up_before = [this](Duration time) {
+    bool is_over = false;
+    EventSource timer = EventSource::timer(loop, [&] { is_over = true; });
+    timer.enable_in(time);
+    wait([&] { return up || is_over; });
+    return up;
+  };
+  dialer->stop({Errc::unavailable, "its host is down"});
+  EXPECT_EQ(wait_for_down().message, "its host is down");
+  EXPECT_FALSE(is_up_before(10 * channel::ConnectPlan::kFirstPause)) << "it was up";
+  dialer->retry_now();
+  wait([this] { return up; });
+  dialer->restart({Errc::unavailable, "again"});
+  wait([this] { return downs.size() == 2; });
+  dialer->stop({Errc::unavailable, "it pauses already"});
+  EXPECT_FALSE(is_up_before(10 * channel::ConnectPlan::kFirstPause)) << "it paused";
+  EXPECT_EQ(downs.size(), 2u);
 }
 
 TEST_F(DialerTest, ReportsWhyNoAddressOfANameWorked) {
