@@ -62,7 +62,7 @@ class Dialer final : private FrameConnection::Observer {
   Dialer& operator=(const Dialer&) = delete;
 
   // Ends the pause, or what stop() began: the other side may just have become available. So it ends
-  // a round of attempts that waits for an answer for `patience` or longer: the kernel repeats a lost
+  // a round of attempts that has waited for `patience` or longer, too: the kernel repeats a lost
   // first packet only after a second.
   void retry_now(Duration patience = Duration::max());
   static constexpr Duration kMinRound = std::chrono::milliseconds(500);
