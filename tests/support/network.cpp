@@ -154,15 +154,17 @@ void Network::heal(int host) {
   ip("link set " + name(host) + " up\n");
 }
 
-void Network::block(int host) {
+void Network::set_port_state(int host, const char* state) {
   const Inside inside(switch_.get());
-  ip("link set " + name(host) + " type bridge_slave state 0\n");  // BR_STATE_DISABLED
+  const Finished finished = run({"bridge", "link", "set", "dev", name(host), "state", state});
+  if (finished.exit_status == 0) return;
+  std::fprintf(stderr, "test harness: bridge link set: %s", finished.err.c_str());
+  std::abort();
 }
 
-void Network::unblock(int host) {
-  const Inside inside(switch_.get());
-  ip("link set " + name(host) + " type bridge_slave state 3\n");  // BR_STATE_FORWARDING
-}
+void Network::block(int host) { set_port_state(host, "disabled"); }
+
+void Network::unblock(int host) { set_port_state(host, "forwarding"); }
 
 Result<void> Network::shape(int host, const std::string& how) {
   const Inside inside(switch_.get());

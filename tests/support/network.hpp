@@ -78,6 +78,7 @@ class Network {
  private:
   Network() = default;
   void connect(int host, const std::string& port, const std::string& interface);
+  void set_port_state(int host, const char* state);
   UniqueFd switch_;
   std::vector<UniqueFd> hosts_;
 };
