@@ -41,7 +41,7 @@ Duration ConnectPlan::end_round(MonoTime now, bool avoid_address) {
   const auto up_since = std::exchange(up_since_, std::nullopt);
   if (up_since && now - *up_since >= kUsefulTime) {
     pause_ = kFirstPause;
-    lost_at_ = now;
+    lost_at_ = is_fast_ ? std::optional(now) : std::nullopt;
     round_ = 0;
   }
   ++round_;

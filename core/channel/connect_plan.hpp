@@ -8,9 +8,9 @@
 //           the connection was given up, the next round begins with the address after it
 //   pause   between rounds, from kFirstPause on, doubled each time, up to kMaxPause. It starts
 //           again with kFirstPause after a connection that was useful
-//   recent  for kRecentTime after such a connection, attempts and pauses are short. What took it
-//           away, as a cut cable or a restart, is usually soon over, and the kernel repeats a first
-//           packet that was lost only after 1 s
+//   recent  for kRecentTime after such a connection, if the network was fast, attempts and pauses
+//           are short. What took it away, as a cut cable or a restart, is usually soon over, and the
+//           kernel repeats a first packet that was lost only after 1 s
 #pragma once
 
 #include <dssm/result.hpp>
@@ -33,8 +33,10 @@ class ConnectPlan {
   static constexpr Duration kRecentTime = std::chrono::minutes(1);
   static constexpr Duration kRecentPause = std::chrono::milliseconds(100);    // at most
   static constexpr Duration kRecentTimeout = std::chrono::milliseconds(200);  // for one address
+  // That network was fast: it took at most so long to connect.
+  static constexpr Duration kFastConnect = std::chrono::milliseconds(50);
   // One in so many rounds has kConnectTimeout then, too: the network may have become slow.
-  static constexpr int kPatientRound = 8;
+  static constexpr int kPatientRound = 32;
   // A connection that was up for so long was useful.
   static constexpr Duration kUsefulTime = std::chrono::seconds(2);
 
@@ -54,6 +56,8 @@ class ConnectPlan {
   // Connecting to address() failed. Whether there is a next one, which is address() now.
   bool next_address() noexcept;
 
+  // It took so long to connect to address().
+  void on_connected(Duration took) noexcept { is_fast_ = took <= kFastConnect; }
   // The greeting is done.
   void on_up(MonoTime now) noexcept { up_since_ = now; }
   // The round failed, or the connection ended. avoid_address: address() is tried last in the next
@@ -69,7 +73,8 @@ class ConnectPlan {
   std::size_t current_ = 0;
   std::string avoided_;  // the address to try last; empty: none
   std::optional<MonoTime> up_since_;
-  std::optional<MonoTime> lost_at_;  // when the last useful connection ended
+  bool is_fast_ = false;             // the network, when it was connected last
+  std::optional<MonoTime> lost_at_;  // when the last useful connection ended, on a fast network
   bool is_recent_ = false;           // that was less than kRecentTime ago
   int round_ = 0;                    // since then
   Duration pause_ = kFirstPause;     // the next one

@@ -76,7 +76,7 @@ void PeerConnection::set_addresses(const std::vector<wire::Address>& addresses) 
 }
 
 void PeerConnection::on_network_changed() {
-  if (status_.state != HostState::up) dialer_.retry_now(Dialer::kMinRound);
+  if (status_.state != HostState::up) dialer_.retry_now(Dialer::kMinAttempt);
 }
 
 void PeerConnection::enter(HostState state, HostReason reason, std::optional<Error> error) {

@@ -30,7 +30,7 @@ void Dialer::retry_now(Duration patience) {
   stopped_ = false;
   plan_.reset_pause();
   if (state_ == State::pause) timer_.enable_in(Duration::zero());
-  if (state_ == State::connect && loop_.now() - round_began_ >= patience) begin_round_soon();
+  if (state_ == State::connect && loop_.now() - attempt_began_ >= patience) begin_round_soon();
 }
 
 void Dialer::stop(const Error& why) {
@@ -115,7 +115,6 @@ void Dialer::begin_round() {
   handshake_.reset();
   them_.reset();
   reason_.reset();
-  round_began_ = loop_.now();
   state_ = State::look_up;
   reached_ = Phase::look_up;
   std::vector<wire::SocketAddress> numbers;
@@ -141,6 +140,7 @@ void Dialer::try_address() {
   if (!started) return try_next_address(started.error());
   state_ = State::connect;
   reached_ = Phase::connect;
+  attempt_began_ = loop_.now();
   socket_ = *std::move(started);
   connected_ = EventSource::writable(loop_, socket_.get(), [this] { on_connected(); });
   connected_.enable();
@@ -159,6 +159,7 @@ void Dialer::on_connected() {
     // From the timer, because `connected_` must not be replaced while its callback runs.
     return timer_.enable_in(Duration::zero());
   }
+  plan_.on_connected(loop_.now() - attempt_began_);
   wire::set_channel_options(socket_.get());
   reached_ = Phase::greet;
   if (const auto credentials = wire::credentials_of(options_.self)) {

@@ -62,10 +62,10 @@ class Dialer final : private FrameConnection::Observer {
   Dialer& operator=(const Dialer&) = delete;
 
   // Ends the pause, or what stop() began: the other side may just have become available. So it ends
-  // a round of attempts that has waited for `patience` or longer, too: the kernel repeats a lost
-  // first packet only after a second.
+  // an attempt that has waited for an answer for `patience` or longer, too, and begins a new round:
+  // the kernel repeats a lost first packet only after a second.
   void retry_now(Duration patience = Duration::max());
-  static constexpr Duration kMinRound = std::chrono::milliseconds(500);
+  static constexpr Duration kMinAttempt = std::chrono::milliseconds(500);
   // Gives up the connection or the attempt that is under way: on_down() follows from the loop, then
   // the next attempt after the pause that is due. During a pause: nothing.
   void restart(const Error& why);
@@ -125,7 +125,7 @@ class Dialer final : private FrameConnection::Observer {
   State state_ = State::pause;
   Phase reached_ = Phase::look_up;  // in this round, or in the last one
   channel::ConnectPlan plan_;
-  MonoTime round_began_{};
+  MonoTime attempt_began_{};
   Resolver::Ticket lookup_;
   UniqueFd socket_;  // while it connects
   wire::TlsTicket ticket_;

@@ -83,6 +83,7 @@ TEST(ConnectPlan, TriesOftenForAWhileAfterAConnectionThatWasUseful) {
   ConnectPlan plan;
   plan.begin_round(addresses(1));
   MonoTime now(100s);
+  plan.on_connected(ConnectPlan::kFastConnect);
   plan.on_up(now);
   const MonoTime lost = now += 1h;
   plan.end_round(now, false);
@@ -101,8 +102,19 @@ TEST(ConnectPlan, TriesOftenForAWhileAfterAConnectionThatWasUseful) {
     EXPECT_LE(pause, ConnectPlan::kRecentPause);
     now += pause;
   }
-  // Eight rounds take 7 short timeouts, a long one and 8 pauses.
-  EXPECT_NEAR(patient, ConnectPlan::kRecentTime / 4200ms, 2);
+  // 32 rounds take 31 short timeouts, a long one and 32 pauses.
+  EXPECT_NEAR(patient, ConnectPlan::kRecentTime / 11400ms, 1);
+  EXPECT_GE(patient, 1);
+  plan.begin_round(addresses(1));
+  EXPECT_EQ(plan.connect_timeout(), ConnectPlan::kConnectTimeout);
+}
+
+TEST(ConnectPlan, HasPatienceWithANetworkOnWhichItTookLongToConnect) {
+  ConnectPlan plan;
+  plan.begin_round(addresses(1));
+  plan.on_connected(ConnectPlan::kFastConnect + 1ms);
+  plan.on_up(MonoTime(100s));
+  plan.end_round(MonoTime(200s), false);
   plan.begin_round(addresses(1));
   EXPECT_EQ(plan.connect_timeout(), ConnectPlan::kConnectTimeout);
 }

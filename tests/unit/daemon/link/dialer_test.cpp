@@ -208,13 +208,13 @@ TEST_F(DialerTest, LeavesAnAttemptThatWaitsForAnAnswerWhenTheNetworkChanged) {
   dial({"pc2", 1});
   wait([this] { return dialer->reached() == Dialer::Phase::connect; });
   answers = wire::resolve_number(owner.address());
-  dialer->retry_now(Dialer::kMinRound);  // it has just begun
+  dialer->retry_now(Dialer::kMinAttempt);  // it has just begun
   bool is_old = false;
   EventSource timer = EventSource::timer(loop, [&] { is_old = true; });
-  timer.enable_in(Dialer::kMinRound);
+  timer.enable_in(Dialer::kMinAttempt);
   wait([&] { return up || is_old; });
   EXPECT_FALSE(up);
-  dialer->retry_now(Dialer::kMinRound);
+  dialer->retry_now(Dialer::kMinAttempt);
   // No timer runs here, so nothing times out. The name is resolved by a thread, in real time.
   while (!up) event_base_loop(loop.base(), EVLOOP_ONCE);
   EXPECT_TRUE(downs.empty());
