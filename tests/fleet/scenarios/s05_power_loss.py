@@ -3,9 +3,11 @@
 
 Both durations are printed with the promised one, but not asserted, because this machine may be busy.
 The test asserts that missing heartbeats were the reason for the removal, and nothing slower. Readers
-on other PCs continue with the PC's new streams and get the status `restarted`.
+on other PCs continue with the PC's new streams and get the status `restarted`. A recording that was
+being made on the PC opens without a repair, and lacks at most its last seconds.
 """
 
+import json
 import time
 
 from lab.dssmd import HOST_DOWN, journal_of
@@ -17,6 +19,10 @@ from lab.timing import PART
 STREAM = "powered:0@pc1"
 # docs/discovery.md, on a machine that is not busy.
 PROMISED_SECONDS = 3
+RECORDING = "/var/tmp/cut.mcap"
+RECORDED_SECONDS = 6.0
+# docs/recording.md promises 2, on a machine that is not busy.
+MAX_LOST_SECONDS = 5.0
 
 
 def run(lab: Lab) -> None:
@@ -25,8 +31,12 @@ def run(lab: Lab) -> None:
     Load(pc1, "write", [STREAM]).await_ready()
     reader = Load(pc2, "read", [STREAM]).await_ready()
     lab.await_streams(STREAM)
+    pc1.ssh.start(f"dssmctl record powered -o {RECORDING}")
+    await_recording(pc1)
+    time.sleep(RECORDED_SECONDS)
     logged = {guest: len(journal_of(guest, HOST_DOWN)) for guest in (pc2, pc3)}
     lost = time.monotonic()
+    cut_ns = time.time_ns()
     pc1.power_off()
     lab.await_streams(on=[pc2, pc3])
     removed = time.monotonic() - lost
@@ -35,6 +45,7 @@ def run(lab: Lab) -> None:
     with lab.timing.step(PART + "boot pc1"), lab.spread():
         pc1.power_on(lab.all_cores)
         pc1.await_running()
+    expect_recorded(pc1, cut_ns)
     writer = Load(pc1, "write", [STREAM]).await_ready()
     answered = time.monotonic()
     lab.await_streams(STREAM)
@@ -49,6 +60,29 @@ def run(lab: Lab) -> None:
     assert written > 0
     pc1.ssh.run(f"dssmctl rm {STREAM}")
     lab.await_streams()
+
+
+def await_recording(guest: Guest) -> None:
+    """Waits until the recording there has samples."""
+    def check() -> tuple[bool, object]:
+        found = guest.ssh.attempt(f"dssmctl info {RECORDING} --json")
+        return found.returncode == 0 and json.loads(found.stdout)["samples"] > 0, found.stderr
+
+    await_that(f"{guest.name} records", check)
+
+
+def expect_recorded(guest: Guest, cut_ns: int) -> None:
+    """Checks what the recording has of the time before the cut."""
+    found = json.loads(guest.ssh.run(f"dssmctl info {RECORDING} --json"))
+    assert found["lost_samples"] == 0, found
+    stream, = found["streams"]
+    assert stream["samples"] == stream["last_tid"] - stream["first_tid"] + 1, found
+    missing = (cut_ns - found["last_time_ns"]) / 1e9
+    lasted = (found["last_time_ns"] - found["first_time_ns"]) / 1e9
+    print(f"  | the recording has {lasted:.1f} s, and lacks the last {missing:.1f} s before the power loss; promised: 2 s",
+          flush=True)
+    assert missing < MAX_LOST_SECONDS, found
+    guest.ssh.run(f"rm {RECORDING}")
 
 
 def expect_peer_timeout(guest: Guest, before: int) -> None:
