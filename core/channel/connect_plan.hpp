@@ -9,7 +9,7 @@
 //   pause   between rounds, from kFirstPause on, doubled each time, up to kMaxPause. It starts
 //           again with kFirstPause after a connection that was useful
 //   recent  for kRecentTime after such a connection, if the network was fast, attempts and pauses
-//           are short. What took it away, as a cut cable or a restart, is usually soon over, and the
+//           are short. What ended it, as a cut cable or a restart, is usually soon over, and the
 //           kernel repeats a first packet that was lost only after 1 s
 #pragma once
 
