@@ -43,6 +43,8 @@ Duration ConnectPlan::end_round(MonoTime now, bool avoid_address) {
     pause_ = kFirstPause;
     lost_at_ = is_fast_ ? std::optional(now) : std::nullopt;
     round_ = 0;
+  } else if (up_since || avoid_address) {
+    lost_at_.reset();  // it is there, and does not want this connection
   }
   ++round_;
   is_recent_ = lost_at_ && now - *lost_at_ < kRecentTime;

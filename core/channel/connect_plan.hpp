@@ -8,9 +8,10 @@
 //           the connection was given up, the next round begins with the address after it
 //   pause   between rounds, from kFirstPause on, doubled each time, up to kMaxPause. It starts
 //           again with kFirstPause after a connection that was useful
-//   recent  for kRecentTime after such a connection, if the network was fast, attempts and pauses
-//           are short. What ended it, as a cut cable or a restart, is usually soon over, and the
-//           kernel repeats a first packet that was lost only after 1 s
+//   recent  for kRecentTime after a useful connection on a fast network, attempts and pauses are
+//           short, unless the other side accepts connections and ends them. What ended the useful
+//           one, as a cut cable or a restart, is usually soon over, and the kernel repeats a first
+//           packet that was lost only after 1 s
 #pragma once
 
 #include <dssm/result.hpp>
@@ -28,14 +29,16 @@ class ConnectPlan {
  public:
   static constexpr Duration kFirstPause = std::chrono::milliseconds(10);
   static constexpr Duration kMaxPause = std::chrono::seconds(1);
-  // For one address: longer than the kernel takes to repeat a lost first packet (1 s).
+  // When the kernel repeats a lost first packet.
+  static constexpr Duration kFirstRepeat = std::chrono::seconds(1);
+  // For one address: longer than that.
   static constexpr Duration kConnectTimeout = std::chrono::seconds(2);
   static constexpr Duration kRecentTime = std::chrono::minutes(1);
   static constexpr Duration kRecentPause = std::chrono::milliseconds(100);    // at most
   static constexpr Duration kRecentTimeout = std::chrono::milliseconds(200);  // for one address
-  // That network was fast: it took at most so long to connect.
+  // On a fast network it takes at most so long to connect.
   static constexpr Duration kFastConnect = std::chrono::milliseconds(50);
-  // One in so many rounds has kConnectTimeout then, too: the network may have become slow.
+  // Every so many rounds an attempt has kConnectTimeout: the network may have become slow.
   static constexpr int kPatientRound = 32;
   // A connection that was up for so long was useful.
   static constexpr Duration kUsefulTime = std::chrono::seconds(2);
@@ -56,8 +59,10 @@ class ConnectPlan {
   // Connecting to address() failed. Whether there is a next one, which is address() now.
   bool next_address() noexcept;
 
-  // It took so long to connect to address().
-  void on_connected(Duration took) noexcept { is_fast_ = took <= kFastConnect; }
+  // How long it took to connect to address(). Without this call no network counts as fast.
+  void on_connected(Duration took) noexcept {
+    if (took < kFirstRepeat) is_fast_ = took <= kFastConnect;
+  }
   // The greeting is done.
   void on_up(MonoTime now) noexcept { up_since_ = now; }
   // The round failed, or the connection ended. avoid_address: address() is tried last in the next
@@ -76,7 +81,7 @@ class ConnectPlan {
   bool is_fast_ = false;             // the network, when it was connected last
   std::optional<MonoTime> lost_at_;  // when the last useful connection ended, on a fast network
   bool is_recent_ = false;           // that was less than kRecentTime ago
-  int round_ = 0;                    // since then
+  int round_ = 0;                    // since the last useful connection
   Duration pause_ = kFirstPause;     // the next one
 };
 

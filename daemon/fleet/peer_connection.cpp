@@ -54,12 +54,13 @@ PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver,
 
 PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver, const wire::Address& peer,
                                const wire::Greeting& self, Observer& observer)
-    : PeerConnection(loop, resolver, std::nullopt, {{peer}, self, kMaxOutputBytes}, observer) {}
+    : PeerConnection(loop, resolver, std::nullopt,
+                     {{peer}, self, kMaxOutputBytes, Duration::max(), true}, observer) {}
 
 PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver, const wire::HostId& id,
                                const std::vector<wire::Address>& addresses,
                                const wire::Greeting& self, Observer& observer)
-    : PeerConnection(loop, resolver, id, {addresses, self, kMaxOutputBytes, kFoundRoundTime},
+    : PeerConnection(loop, resolver, id, {addresses, self, kMaxOutputBytes, kFoundRoundTime, true},
                      observer) {}
 
 bool PeerConnection::is_at(const wire::IpAddress& address) const {
@@ -76,7 +77,7 @@ void PeerConnection::set_addresses(const std::vector<wire::Address>& addresses) 
 }
 
 void PeerConnection::on_network_changed() {
-  if (status_.state != HostState::up) dialer_.retry_now(Dialer::kMinAttempt);
+  if (status_.state != HostState::up) dialer_.retry_now(Dialer::kMinRound);
 }
 
 void PeerConnection::enter(HostState state, HostReason reason, std::optional<Error> error) {

@@ -30,7 +30,7 @@ void Dialer::retry_now(Duration patience) {
   stopped_ = false;
   plan_.reset_pause();
   if (state_ == State::pause) timer_.enable_in(Duration::zero());
-  if (state_ == State::connect && loop_.now() - attempt_began_ >= patience) begin_round_soon();
+  if (state_ == State::connect && loop_.now() - round_began_ >= patience) begin_round_soon();
 }
 
 void Dialer::stop(const Error& why) {
@@ -115,6 +115,7 @@ void Dialer::begin_round() {
   handshake_.reset();
   them_.reset();
   reason_.reset();
+  round_began_ = loop_.now();
   state_ = State::look_up;
   reached_ = Phase::look_up;
   std::vector<wire::SocketAddress> numbers;
@@ -159,7 +160,7 @@ void Dialer::on_connected() {
     // From the timer, because `connected_` must not be replaced while its callback runs.
     return timer_.enable_in(Duration::zero());
   }
-  plan_.on_connected(loop_.now() - attempt_began_);
+  if (options_.finds_again) plan_.on_connected(loop_.now() - attempt_began_);
   wire::set_channel_options(socket_.get());
   reached_ = Phase::greet;
   if (const auto credentials = wire::credentials_of(options_.self)) {
@@ -242,7 +243,7 @@ void Dialer::fail(const Error& why) {
       std::exchange(given_up_, false) || state_ == State::greet || state_ == State::secure;
   state_ = State::pause;
   const Duration pause = plan_.end_round(loop_.now(), avoid_address);
-  if (!stopped_) timer_.enable_in(pause);
+  stopped_ ? timer_.disable() : timer_.enable_in(pause);
   observer_.on_down(why);
 }
 

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Keeps one outgoing connection up: looks the address up, connects, exchanges greetings. When the
-// connection breaks it does all of that again, after a pause, and never gives up. Which address is
+// connection breaks it does all of that again, after a pause, until it is stopped. Which address is
 // tried next, and how long the pauses are, is ConnectPlan's. Used by PeerConnection (control
 // connections), mirrors and remote writers (channels).
 //
@@ -38,8 +38,8 @@ class Dialer final : private FrameConnection::Observer {
     virtual void on_up(FrameConnection& connection, const wire::Greeting& them) = 0;
     virtual Result<void> on_frame(net::Frame& frame) = 0;
     virtual void on_output_empty() {}
-    // The connection broke, or a round of attempts failed; the dialer continues by itself. When the
-    // other side refused the connection, `why` holds its reason.
+    // The connection broke, or a round of attempts failed; the dialer continues by itself, unless
+    // it was stopped. When the other side refused the connection, `why` holds its reason.
     virtual void on_down(const Error& why) = 0;
 
    protected:
@@ -53,6 +53,9 @@ class Dialer final : private FrameConnection::Observer {
     wire::Greeting self;  // to send; its credentials are used
     std::size_t max_queued_bytes = 1U << 20;
     Duration round_time = Duration::max();  // as in ConnectPlan
+    // After a connection that was useful the other side is tried often for a while (ConnectPlan).
+    // Where another connection finds out when it is back, that is not needed.
+    bool finds_again = false;
   };
 
   // Starts at once. resolver, loop and observer outlive it. Destroying it, outside of its own
@@ -61,15 +64,15 @@ class Dialer final : private FrameConnection::Observer {
   Dialer(const Dialer&) = delete;
   Dialer& operator=(const Dialer&) = delete;
 
-  // Ends the pause, or what stop() began: the other side may just have become available. So it ends
-  // an attempt that has waited for an answer for `patience` or longer, too, and begins a new round:
-  // the kernel repeats a lost first packet only after a second.
+  // Ends the pause, or what stop() began: the other side may just have become available. Also
+  // ends a round of attempts that began `patience` ago or earlier, and begins a new one: the
+  // kernel repeats a lost first packet only after a second.
   void retry_now(Duration patience = Duration::max());
-  static constexpr Duration kMinAttempt = std::chrono::milliseconds(500);
+  static constexpr Duration kMinRound = std::chrono::milliseconds(500);
   // Gives up the connection or the attempt that is under way: on_down() follows from the loop, then
   // the next attempt after the pause that is due. During a pause: nothing.
   void restart(const Error& why);
-  // The same, but the next attempt comes only after retry_now().
+  // Like restart(), but no attempt follows before retry_now(), also during a pause.
   void stop(const Error& why);
   // The addresses from the next round of attempts on. That begins at once when an attempt waits for
   // an answer; a connection that is up stays as it is.
@@ -97,7 +100,7 @@ class Dialer final : private FrameConnection::Observer {
     greet,    // until their Hello came, or the timer
     up,       // until the connection closes
     give_up,  // restart() was called: until the timer, at once
-    pause,    // until the timer
+    pause,    // until the timer; after stop() until retry_now()
   };
 
   // FrameConnection::Observer
@@ -125,7 +128,7 @@ class Dialer final : private FrameConnection::Observer {
   State state_ = State::pause;
   Phase reached_ = Phase::look_up;  // in this round, or in the last one
   channel::ConnectPlan plan_;
-  MonoTime attempt_began_{};
+  MonoTime round_began_{}, attempt_began_{};
   Resolver::Ticket lookup_;
   UniqueFd socket_;  // while it connects
   wire::TlsTicket ticket_;

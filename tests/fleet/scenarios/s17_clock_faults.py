@@ -116,7 +116,7 @@ def faults_of(guest: Guest, order: random.Random) -> Iterator[Fault]:
     if is_reference:
         yield "returns with a wrong time", returns_with_wrong_time(guest), False
         yield "restarted with a wrong time", restarted_with_wrong_time(guest), True
-        yield "and all others without chronyd", without_chronyd, True
+        yield "all PCs without chronyd", without_chronyd, True
 
 
 def step(guest: Guest, ns: int) -> Callable[[Lab, Truth], None]:

@@ -109,6 +109,21 @@ TEST(ConnectPlan, TriesOftenForAWhileAfterAConnectionThatWasUseful) {
   EXPECT_EQ(plan.connect_timeout(), ConnectPlan::kConnectTimeout);
 }
 
+TEST(ConnectPlan, TriesOftenOnlyWhereNobodyAnswers) {
+  ConnectPlan plan;
+  plan.begin_round(addresses(1));
+  plan.on_connected(1ms);
+  plan.on_connected(ConnectPlan::kFirstRepeat);  // a packet was lost: that says nothing
+  plan.on_up(MonoTime(100s));
+  plan.end_round(MonoTime(200s), false);
+  plan.begin_round(addresses(1));
+  EXPECT_EQ(plan.connect_timeout(), ConnectPlan::kRecentTimeout);
+  plan.on_up(MonoTime(200s));
+  plan.end_round(MonoTime(200s + 1ms), false);  // it greets and then refuses
+  plan.begin_round(addresses(1));
+  EXPECT_EQ(plan.connect_timeout(), ConnectPlan::kConnectTimeout);
+}
+
 TEST(ConnectPlan, HasPatienceWithANetworkOnWhichItTookLongToConnect) {
   ConnectPlan plan;
   plan.begin_round(addresses(1));

@@ -208,13 +208,13 @@ TEST_F(DialerTest, LeavesAnAttemptThatWaitsForAnAnswerWhenTheNetworkChanged) {
   dial({"pc2", 1});
   wait([this] { return dialer->reached() == Dialer::Phase::connect; });
   answers = wire::resolve_number(owner.address());
-  dialer->retry_now(Dialer::kMinAttempt);  // it has just begun
+  dialer->retry_now(Dialer::kMinRound);  // it has just begun
   bool is_old = false;
   EventSource timer = EventSource::timer(loop, [&] { is_old = true; });
-  timer.enable_in(Dialer::kMinAttempt);
+  timer.enable_in(Dialer::kMinRound);
   wait([&] { return up || is_old; });
   EXPECT_FALSE(up);
-  dialer->retry_now(Dialer::kMinAttempt);
+  dialer->retry_now(Dialer::kMinRound);
   // No timer runs here, so nothing times out. The name is resolved by a thread, in real time.
   while (!up) event_base_loop(loop.base(), EVLOOP_ONCE);
   EXPECT_TRUE(downs.empty());
@@ -241,6 +241,44 @@ TEST_F(DialerTest, TriesNoMoreAfterAStopUntilItIsAsked) {
   dialer->stop({Errc::unavailable, "it pauses already"});
   EXPECT_FALSE(is_up_before(10 * channel::ConnectPlan::kFirstPause)) << "it paused";
   EXPECT_EQ(downs.size(), 2u);
+}
+
+TEST_F(DialerTest, TriesNoMoreAfterAStopWhileItGreets) {
+  RawServer server(loop, "", false);
+  dial(server.address());
+  wait([this] { return dialer->reached() == Dialer::Phase::greet; });
+  dialer->stop({Errc::unavailable, "its host is down"});
+  EXPECT_EQ(wait_for_down().message, "its host is down");
+  bool is_over = false;
+  EventSource timer = EventSource::timer(loop, [&] { is_over = true; });
+  timer.enable_in(2 * wire::kHelloTimeout);
+  wait([&] { return is_over; });
+  EXPECT_EQ(server.connections(), 1);
+}
+
+TEST_F(DialerTest, TriesSoonAgainAfterAUsefulConnectionIfItIsToFindTheOtherSide) {
+  for (const bool finds_again : {true, false}) {
+    const SilentServer silent;
+    ScriptedHost owner(loop);
+    answers = {wire::resolve_number(owner.address()).at(0)};
+    downs.clear();
+    Dialer::Options options;
+    options.addresses = {{"pc2", 1}};
+    options.finds_again = finds_again;
+    dial_in_turn({}, std::move(options));
+    wait([this] { return up; });
+    bool is_over = false;
+    EventSource timer = EventSource::timer(loop, [&] { is_over = true; });
+    timer.enable_in(channel::ConnectPlan::kUsefulTime);
+    wait([&] { return is_over; });
+    answers = {silent.address()};
+    owner.cut();
+    wait([this] { return !up; });
+    const MonoTime lost = loop.now();
+    wait([this] { return downs.size() == 2; });
+    const Duration tried = loop.now() - lost - channel::ConnectPlan::kFirstPause;
+    EXPECT_EQ(tried < channel::ConnectPlan::kConnectTimeout, finds_again);
+  }
 }
 
 TEST_F(DialerTest, ReportsWhyNoAddressOfANameWorked) {
