@@ -95,6 +95,7 @@ Result<void> NetworkConnection::connect_next(Error why) {
 
 // The socket is connected.
 Result<void> NetworkConnection::begin() {
+  // step_at_ is when it would have timed out.
   plan_.on_connected(plan_.connect_timeout() - (step_at_ - MonoClock::now()));
   std::unique_ptr<wire::Transport> transport =
       wire::make_transport(std::move(connecting_), wire::TransportEnd::connected);

@@ -19,7 +19,7 @@ void ConnectPlan::begin_round(std::vector<wire::SocketAddress> addresses) {
 
 Duration ConnectPlan::connect_timeout() const noexcept {
   const Duration timeout =
-      is_recent_ && round_ % kPatientRound != 0 ? kRecentTimeout : kConnectTimeout;
+      is_recent_ && round_ % kLongRound != 0 ? kRecentTimeout : kConnectTimeout;
   return std::min(timeout, round_time_ / static_cast<std::int64_t>(addresses_.size()));
 }
 

@@ -39,7 +39,7 @@ class ConnectPlan {
   // On a fast network it takes at most so long to connect.
   static constexpr Duration kFastConnect = std::chrono::milliseconds(50);
   // Every so many rounds an attempt has kConnectTimeout: the network may have become slow.
-  static constexpr int kPatientRound = 32;
+  static constexpr int kLongRound = 32;
   // A connection that was up for so long was useful.
   static constexpr Duration kUsefulTime = std::chrono::seconds(2);
 

@@ -54,8 +54,8 @@ std::uint32_t ppb(clock::PartsPerBillion ageing) noexcept {
       std::clamp<clock::PartsPerBillion>(ageing, 0, ring::ClockAssessment::kMaxAgeingPpb));
 }
 
-// For the log, after why a host's clock is not good here: whether it is the only one, or this PC's
-// clock may be the one that is wrong. good: the other hosts whose clocks are.
+// What the log adds to the reason against one host's clock: it shows whether that clock differs
+// from all others, or this PC's does. good: the hosts whose clocks are good here.
 std::string others_text(const std::vector<std::string>& good) {
   if (good.empty()) return "; those of no other host are good here either";
   if (good.size() == 1) return "; those of " + in_quotes(good[0]) + " are good";
@@ -355,17 +355,17 @@ void FleetClock::update_line(RawTime now) {
 
 void FleetClock::log_others(MonoTime now) {
   if (policies_.general.policy == ClockPolicy::off) return;
-  std::map<wire::HostId, std::string> reasons;
+  std::vector<std::pair<const KnownHost*, std::string>> reasons;
   std::vector<std::string> good;
   for (const auto& [id, host] : catalog_.hosts()) {
     if (id == self_) continue;
     std::string reason = reason_against(host.greeting.clock.get(), policies_.general.limit);
     if (reason.empty()) good.push_back(host.greeting.host);
-    reasons.emplace(id, std::move(reason));
+    reasons.emplace_back(&host, std::move(reason));
   }
-  for (auto& [id, reason] : reasons) {
+  for (auto& [host, reason] : reasons) {
     if (!reason.empty() && reasons.size() > 1) reason += others_text(good);
-    log_.update(id, catalog_.find(id)->greeting.host, reason, now);
+    log_.update(host->greeting.host_id, host->greeting.host, reason, now);
   }
 }
 

@@ -55,12 +55,21 @@ PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver,
 PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver, const wire::Address& peer,
                                const wire::Greeting& self, Observer& observer)
     : PeerConnection(loop, resolver, std::nullopt,
-                     {{peer}, self, kMaxOutputBytes, Duration::max(), true}, observer) {}
+                     {.addresses = {peer},
+                      .self = self,
+                      .max_queued_bytes = kMaxOutputBytes,
+                      .retries_often = true},
+                     observer) {}
 
 PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver, const wire::HostId& id,
                                const std::vector<wire::Address>& addresses,
                                const wire::Greeting& self, Observer& observer)
-    : PeerConnection(loop, resolver, id, {addresses, self, kMaxOutputBytes, kFoundRoundTime, true},
+    : PeerConnection(loop, resolver, id,
+                     {.addresses = addresses,
+                      .self = self,
+                      .max_queued_bytes = kMaxOutputBytes,
+                      .round_time = kFoundRoundTime,
+                      .retries_often = true},
                      observer) {}
 
 bool PeerConnection::is_at(const wire::IpAddress& address) const {

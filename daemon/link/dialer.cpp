@@ -26,11 +26,11 @@ Dialer::Dialer(const EventLoop& loop, Resolver& resolver, Options options, Obser
 
 // --- for the user
 
-void Dialer::retry_now(Duration patience) {
+void Dialer::retry_now(Duration min_age) {
   stopped_ = false;
   plan_.reset_pause();
   if (state_ == State::pause) timer_.enable_in(Duration::zero());
-  if (state_ == State::connect && loop_.now() - round_began_ >= patience) begin_round_soon();
+  if (state_ == State::connect && loop_.now() - round_began_ >= min_age) begin_round_soon();
 }
 
 void Dialer::stop(const Error& why) {
@@ -160,7 +160,7 @@ void Dialer::on_connected() {
     // From the timer, because `connected_` must not be replaced while its callback runs.
     return timer_.enable_in(Duration::zero());
   }
-  if (options_.finds_again) plan_.on_connected(loop_.now() - attempt_began_);
+  if (options_.retries_often) plan_.on_connected(loop_.now() - attempt_began_);
   wire::set_channel_options(socket_.get());
   reached_ = Phase::greet;
   if (const auto credentials = wire::credentials_of(options_.self)) {

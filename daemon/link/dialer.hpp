@@ -53,9 +53,9 @@ class Dialer final : private FrameConnection::Observer {
     wire::Greeting self;  // to send; its credentials are used
     std::size_t max_queued_bytes = 1U << 20;
     Duration round_time = Duration::max();  // as in ConnectPlan
-    // After a connection that was useful the other side is tried often for a while (ConnectPlan).
-    // Where another connection finds out when it is back, that is not needed.
-    bool finds_again = false;
+    // After a useful connection, tries often for a while ("recent" in ConnectPlan). A channel need
+    // not: the control connection finds out when the other side is back.
+    bool retries_often = false;
   };
 
   // Starts at once. resolver, loop and observer outlive it. Destroying it, outside of its own
@@ -65,9 +65,9 @@ class Dialer final : private FrameConnection::Observer {
   Dialer& operator=(const Dialer&) = delete;
 
   // Ends the pause, or what stop() began: the other side may just have become available. Also
-  // ends a round of attempts that began `patience` ago or earlier, and begins a new one: the
+  // ends a round of attempts that began `min_age` ago or earlier, and begins a new one: the
   // kernel repeats a lost first packet only after a second.
-  void retry_now(Duration patience = Duration::max());
+  void retry_now(Duration min_age = Duration::max());
   static constexpr Duration kMinRound = std::chrono::milliseconds(500);
   // Gives up the connection or the attempt that is under way: on_down() follows from the loop, then
   // the next attempt after the pause that is due. During a pause: nothing.

@@ -57,6 +57,13 @@ std::string path_of(const UniqueFd& fd) {
   return "/proc/" + std::to_string(::getpid()) + "/fd/" + std::to_string(fd.get());
 }
 
+void run_or_abort(const std::vector<std::string>& command) {
+  const Finished finished = run(command);
+  if (finished.exit_status == 0) return;
+  std::fprintf(stderr, "test harness: %s: %s", command[0].c_str(), finished.err.c_str());
+  std::abort();
+}
+
 }  // namespace
 
 Inside::Inside(int network_namespace) : before_(namespace_of_this_thread()) {
@@ -138,10 +145,7 @@ Result<void> Network::swallow(int host) {
 
 void Network::stop_swallowing(int host) {
   const Inside in_host = inside(host);
-  const Finished finished = run({"/usr/sbin/nft", "delete", "table", "inet", "swallow"});
-  if (finished.exit_status == 0) return;
-  std::fprintf(stderr, "test harness: nft delete: %s", finished.err.c_str());
-  std::abort();
+  run_or_abort({"/usr/sbin/nft", "delete", "table", "inet", "swallow"});
 }
 
 void Network::cut(int host) {
@@ -156,10 +160,7 @@ void Network::heal(int host) {
 
 void Network::set_port_state(int host, const char* state) {
   const Inside inside(switch_.get());
-  const Finished finished = run({"bridge", "link", "set", "dev", name(host), "state", state});
-  if (finished.exit_status == 0) return;
-  std::fprintf(stderr, "test harness: bridge link set: %s", finished.err.c_str());
-  std::abort();
+  run_or_abort({"bridge", "link", "set", "dev", name(host), "state", state});
 }
 
 void Network::block(int host) { set_port_state(host, "disabled"); }

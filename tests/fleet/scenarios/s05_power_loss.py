@@ -20,7 +20,7 @@ STREAM = "powered:0@pc1"
 # docs/discovery.md, on a machine that is not busy.
 PROMISED_SECONDS = 3
 RECORDING = "/var/tmp/cut.mcap"
-RECORDED_SECONDS = 6.0
+RECORDED_SAMPLES = 6 * RATE_HZ
 # docs/recording.md promises 2, on a machine that is not busy.
 MAX_LOST_SECONDS = 5.0
 
@@ -33,7 +33,7 @@ def run(lab: Lab) -> None:
     lab.await_streams(STREAM)
     pc1.ssh.start(f"dssmctl record powered -o {RECORDING}")
     await_recording(pc1)
-    time.sleep(RECORDED_SECONDS)
+    reader.await_more(RECORDED_SAMPLES)
     logged = {guest: len(journal_of(guest, HOST_DOWN)) for guest in (pc2, pc3)}
     before_cut = writer.moved()
     lost = time.monotonic()

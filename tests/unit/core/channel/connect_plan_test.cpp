@@ -87,12 +87,12 @@ TEST(ConnectPlan, TriesOftenForAWhileAfterAConnectionThatWasUseful) {
   plan.on_up(now);
   const MonoTime lost = now += 1h;
   plan.end_round(now, false);
-  int patient = 0;
+  int long_rounds = 0;
   while (true) {
     plan.begin_round(addresses(1));
     const Duration timeout = plan.connect_timeout();
     EXPECT_TRUE(timeout == ConnectPlan::kRecentTimeout || timeout == ConnectPlan::kConnectTimeout);
-    if (timeout == ConnectPlan::kConnectTimeout) ++patient;
+    if (timeout == ConnectPlan::kConnectTimeout) ++long_rounds;
     now += timeout;
     const Duration pause = plan.end_round(now, false);
     if (now - lost >= ConnectPlan::kRecentTime) {
@@ -103,8 +103,8 @@ TEST(ConnectPlan, TriesOftenForAWhileAfterAConnectionThatWasUseful) {
     now += pause;
   }
   // 32 rounds take 31 short timeouts, a long one and 32 pauses.
-  EXPECT_NEAR(patient, ConnectPlan::kRecentTime / 11400ms, 1);
-  EXPECT_GE(patient, 1);
+  EXPECT_NEAR(long_rounds, ConnectPlan::kRecentTime / 11400ms, 1);
+  EXPECT_GE(long_rounds, 1);
   plan.begin_round(addresses(1));
   EXPECT_EQ(plan.connect_timeout(), ConnectPlan::kConnectTimeout);
 }
@@ -124,7 +124,7 @@ TEST(ConnectPlan, TriesOftenOnlyWhereNobodyAnswers) {
   EXPECT_EQ(plan.connect_timeout(), ConnectPlan::kConnectTimeout);
 }
 
-TEST(ConnectPlan, HasPatienceWithANetworkOnWhichItTookLongToConnect) {
+TEST(ConnectPlan, GivesASlowNetworkMoreTime) {
   ConnectPlan plan;
   plan.begin_round(addresses(1));
   plan.on_connected(ConnectPlan::kFastConnect + 1ms);

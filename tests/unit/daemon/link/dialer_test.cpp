@@ -95,6 +95,17 @@ class DialerTest : public testing::Test, protected Dialer::Observer {
     dial(wire::Address::parse(address.str()).value());
   }
   void wait(const std::function<bool()>& done) { run_until(loop, done); }
+  // Whether it is done before `time` is over.
+  bool is_done_within(Duration time, const std::function<bool()>& done) {
+    bool is_over = false;
+    EventSource timer = EventSource::timer(loop, [&] { is_over = true; });
+    timer.enable_in(time);
+    wait([&] { return done() || is_over; });
+    return done();
+  }
+  void wait_for(Duration time) {
+    is_done_within(time, [] { return false; });
+  }
   const Error& wait_for_down() {
     wait([this] { return !downs.empty(); });
     return downs.front();
@@ -176,11 +187,8 @@ TEST_F(DialerTest, LetsItsAddressesShareTheTimeOfARound) {
   Dialer::Options options;
   options.round_time = std::chrono::milliseconds(40);
   dial_in_turn({dead, dead, dead, wire::resolve_number(owner.address()).at(0)}, options);
-  bool timed_out = false;
-  EventSource timer = EventSource::timer(loop, [&] { timed_out = true; });
-  timer.enable_in(channel::ConnectPlan::kConnectTimeout);  // what one address would take else
-  wait([&] { return up || timed_out; });
-  EXPECT_TRUE(up);
+  // One address would take so long otherwise.
+  EXPECT_TRUE(is_done_within(channel::ConnectPlan::kConnectTimeout, [this] { return up; }));
   EXPECT_TRUE(downs.empty());
 }
 
@@ -209,11 +217,7 @@ TEST_F(DialerTest, LeavesAnAttemptThatWaitsForAnAnswerWhenTheNetworkChanged) {
   wait([this] { return dialer->reached() == Dialer::Phase::connect; });
   answers = wire::resolve_number(owner.address());
   dialer->retry_now(Dialer::kMinRound);  // it has just begun
-  bool is_old = false;
-  EventSource timer = EventSource::timer(loop, [&] { is_old = true; });
-  timer.enable_in(Dialer::kMinRound);
-  wait([&] { return up || is_old; });
-  EXPECT_FALSE(up);
+  EXPECT_FALSE(is_done_within(Dialer::kMinRound, [this] { return up; }));
   dialer->retry_now(Dialer::kMinRound);
   // No timer runs here, so nothing times out. The name is resolved by a thread, in real time.
   while (!up) event_base_loop(loop.base(), EVLOOP_ONCE);
@@ -224,22 +228,18 @@ TEST_F(DialerTest, TriesNoMoreAfterAStopUntilItIsAsked) {
   ScriptedHost owner(loop);
   dial(owner.address());
   wait([this] { return up; });
-  const auto is_up_before = [this](Duration time) {
-    bool is_over = false;
-    EventSource timer = EventSource::timer(loop, [&] { is_over = true; });
-    timer.enable_in(time);
-    wait([&] { return up || is_over; });
-    return up;
+  const auto is_up_soon = [this] {
+    return is_done_within(10 * channel::ConnectPlan::kFirstPause, [this] { return up; });
   };
   dialer->stop({Errc::unavailable, "its host is down"});
   EXPECT_EQ(wait_for_down().message, "its host is down");
-  EXPECT_FALSE(is_up_before(10 * channel::ConnectPlan::kFirstPause)) << "it was up";
+  EXPECT_FALSE(is_up_soon()) << "it was up";
   dialer->retry_now();
   wait([this] { return up; });
   dialer->restart({Errc::unavailable, "again"});
   wait([this] { return downs.size() == 2; });
   dialer->stop({Errc::unavailable, "it pauses already"});
-  EXPECT_FALSE(is_up_before(10 * channel::ConnectPlan::kFirstPause)) << "it paused";
+  EXPECT_FALSE(is_up_soon()) << "it paused";
   EXPECT_EQ(downs.size(), 2u);
 }
 
@@ -249,35 +249,29 @@ TEST_F(DialerTest, TriesNoMoreAfterAStopWhileItGreets) {
   wait([this] { return dialer->reached() == Dialer::Phase::greet; });
   dialer->stop({Errc::unavailable, "its host is down"});
   EXPECT_EQ(wait_for_down().message, "its host is down");
-  bool is_over = false;
-  EventSource timer = EventSource::timer(loop, [&] { is_over = true; });
-  timer.enable_in(2 * wire::kHelloTimeout);
-  wait([&] { return is_over; });
+  wait_for(2 * wire::kHelloTimeout);
   EXPECT_EQ(server.connections(), 1);
 }
 
-TEST_F(DialerTest, TriesSoonAgainAfterAUsefulConnectionIfItIsToFindTheOtherSide) {
-  for (const bool finds_again : {true, false}) {
+TEST_F(DialerTest, TriesSoonAgainAfterAUsefulConnectionIfItIsToRetryOften) {
+  for (const bool retries_often : {true, false}) {
     const SilentServer silent;
     ScriptedHost owner(loop);
     answers = {wire::resolve_number(owner.address()).at(0)};
     downs.clear();
     Dialer::Options options;
     options.addresses = {{"pc2", 1}};
-    options.finds_again = finds_again;
+    options.retries_often = retries_often;
     dial_in_turn({}, std::move(options));
     wait([this] { return up; });
-    bool is_over = false;
-    EventSource timer = EventSource::timer(loop, [&] { is_over = true; });
-    timer.enable_in(channel::ConnectPlan::kUsefulTime);
-    wait([&] { return is_over; });
+    wait_for(channel::ConnectPlan::kUsefulTime);
     answers = {silent.address()};
     owner.cut();
     wait([this] { return !up; });
     const MonoTime lost = loop.now();
     wait([this] { return downs.size() == 2; });
     const Duration tried = loop.now() - lost - channel::ConnectPlan::kFirstPause;
-    EXPECT_EQ(tried < channel::ConnectPlan::kConnectTimeout, finds_again);
+    EXPECT_EQ(tried < channel::ConnectPlan::kConnectTimeout, retries_often);
   }
 }
 
