@@ -144,7 +144,8 @@ TEST_F(BlackBox, TellsRequestsThatWereBeforeItByTheirNumbersNotTheirTimes) {
   ctl::set_text(request.name, "earlier");
   requests.write(request, WallClock::now() + 1h);
   Running running(recorder({"--after", "1ms"}), environment());
-  await_armed(power.id());
+  // It records the stream of the requests, and waits for requests: two readers.
+  await([&] { return session_.stream_info(requests.id()).value().readers == 2; });
   request = {};
   ctl::set_text(request.name, "behind");
   requests.write(request, WallClock::now() - 1h);
