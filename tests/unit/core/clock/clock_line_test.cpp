@@ -52,7 +52,7 @@ TEST(ClockLine, ShowsOnlyWhatIsCertain) {
 TEST(ClockLine, TakesItsRateFromReadingsThatAreFarEnoughApart) {
   ClockReading from{kStart, kWall, 5us};
   ClockLine line = ClockLine::through(from, 100);
-  EXPECT_EQ(line.tolerance, ClockLine::kMaxOff + 15us);
+  EXPECT_EQ(line.tolerance, ClockLine::kMaxOff + 7500ns);
   const ClockReading soon{kStart + 10ms, kWall + 11ms, 5us};  // certain to 10 us
   line = ClockLine::after(line, from, soon);
   EXPECT_EQ(line.raw, soon.raw);

@@ -28,7 +28,7 @@ struct Pc {
   ClockLine line;
   ClockReading rate_from;
   int lines = 0;
-  double blur_ns = 0;  // of its readings, which are wrong by that much at most
+  double blur_ns = 0;  // of its readings, which are wrong by a tenth of that at most
   std::mt19937 random{7};
 
   void pass(double true_ns) {
@@ -44,7 +44,7 @@ struct Pc {
     line = ClockLine::through(rate_from, line.rate);
   }
   ClockReading reading() {
-    const double wrong = std::uniform_real_distribution<double>(-blur_ns, blur_ns)(random);
+    const double wrong = std::uniform_real_distribution<double>(-blur_ns, blur_ns)(random) / 10;
     return {raw() + ns(wrong), wall(), ns(blur_ns)};
   }
   // As FleetClock does before each batch of samples.
