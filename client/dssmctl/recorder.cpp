@@ -204,6 +204,7 @@ void Recorder::Opener::run() {
     const Wanted wanted = *next;
     lock.unlock();
     Result<Source> opened = open(wanted);
+    if (opened) find_type(*opened);
     lock.lock();
     // It may have been removed meanwhile, and created again.
     const auto entry = std::find_if(wanted_.begin(), wanted_.end(), [&](const Wanted& other) {
@@ -240,7 +241,7 @@ Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
   RawReader reader = DSSM_TRY(
       session.open_raw_reader(wanted.stream.id, nullptr, 0,
                               with_history ? FetchHistory::at_once : FetchHistory::when_read));
-  Source source{std::move(reader), 0, kNoTid, kNoTid, {}, {}, true, {}, {}};
+  Source source{std::move(reader), 0, kNoTid, kNoTid, {}, {}, true, {}, {}, {}};
   if (property) source.property = *std::move(property);
   const Tid newest = source.reader.newest_tid();
   // The stamps of a recording that is being played are of another time than now.
@@ -264,6 +265,16 @@ Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
     if (source.from) skip_to(source.reader, *source.from);
   }
   return source;
+}
+
+void Recorder::Opener::find_type(Source& source) {
+  const StreamId id = source.reader.id();
+  if (!source.reader.type().fields.empty()) return;
+  std::optional<ProgramType> type = obvious_type_of_programs(session_, id);
+  if (!type) return;
+  source.obvious = std::move(type->found.type);
+  const std::lock_guard lock(mutex_);
+  notices_.push_back(obvious_text(id, source.obvious, type->source, "recorded"));
 }
 
 std::vector<Recorder::Source> Recorder::Opener::take_opened() {
@@ -395,7 +406,7 @@ Result<void> Recorder::add(Source source) {
 Result<void> Recorder::add_to_file(Source& source) {
   const RawReader& reader = source.reader;
   source.number =
-      DSSM_TRY(file_->add_stream({reader.id(), reader.type(), reader.depth(), reader.cycle(),
+      DSSM_TRY(file_->add_stream({reader.id(), source.type(), reader.depth(), reader.cycle(),
                                   reader.incarnation(), source.property}));
   return {};
 }
@@ -606,7 +617,7 @@ bool Recorder::has_past() const {
 std::vector<std::string> Recorder::streams_without_fields() const {
   std::vector<std::string> names;
   for (const Source& source : sources_) {
-    if (source.reader.type().fields.empty()) names.push_back(source.reader.id().str());
+    if (source.type().fields.empty()) names.push_back(source.reader.id().str());
   }
   return names;
 }

@@ -24,6 +24,7 @@
 #include <utility>
 #include <vector>
 
+#include "client/dssmctl/describe_stream.hpp"
 #include "client/dssmctl/names.hpp"
 
 namespace dssm::ctl {
@@ -84,7 +85,8 @@ class Recorder {
   bool is_past_late();
 
   std::size_t streams() const { return sources_.size(); }
-  // Those whose description has no fields: of them the file has only bytes.
+  // Those that are not described, and whose programs do not show what they write: of them the file
+  // has only bytes.
   std::vector<std::string> streams_without_fields() const;
   // Of the file, or of the last one; there was one.
   RecordingProgress progress() const { return file_->progress(); }
@@ -145,6 +147,9 @@ class Recorder {
     bool is_of_now = true;            // its stamps are of this time, and not of one that is played
     std::vector<std::byte> property;  // that the file has, or gets at its beginning
     std::vector<NewProperty> new_properties;  // the file has not yet
+    TypeInfo obvious;                         // obvious_type_of_programs(), if it is not described
+
+    const TypeInfo& type() const { return type_to_show(reader.type(), obvious); }
   };
   static Time past_of(const Source& source, Time now, Duration past);
 
@@ -193,6 +198,8 @@ class Recorder {
     void on_event(const StreamEvent& event);
     void run();
     Result<Source> open(const Wanted& wanted) const;
+    // The type of its programs, and a notice, if it is not described.
+    void find_type(Source& source);
 
     Session session_;
     RecorderPlan plan_;

@@ -98,7 +98,7 @@ TEST_F(Describe, GivesTheStreamOfAProgramNamesThatStay) {
   EXPECT_THAT(again.err, Not(HasSubstr("theta"))) << "one line, whatever the type has";
 }
 
-TEST_F(Describe, EchoShowsTheFieldsOfAProgramThatRuns) {
+TEST_F(Describe, EchoPlotAndRecordKnowTheFieldsOfAProgramThatRuns) {
   start_program("old_logger-debug");
   const Finished echo = ctl({"echo", "--last", "spur_odometry:3"});
   ASSERT_EQ(echo.exit_status, 0) << echo.err;
@@ -108,6 +108,12 @@ TEST_F(Describe, EchoShowsTheFieldsOfAProgramThatRuns) {
   const Finished plot = ctl({"plot", "spur_odometry:3.theta", "--for", "10ms"});
   EXPECT_EQ(plot.exit_status, 0) << plot.err;
   EXPECT_THAT(plot.out, HasSubstr(" 0.25\n"));
+  const std::string recording = folder + "/odometry.mcap";
+  const Finished record = ctl({"record", "--past", "1h", "spur_odometry:3", "-o", recording});
+  EXPECT_EQ(record.exit_status, 0) << record.err;
+  EXPECT_THAT(record.err, HasSubstr("'spur_odometry:3@pc1' is recorded as "));
+  EXPECT_THAT(record.err, Not(HasSubstr("without descriptions")));
+  EXPECT_THAT(ctl({"info", "--json", recording}).out, HasSubstr("theta"));
   EXPECT_TRUE(session.stream_info(kStream)->type.fields.empty()) << "they change nothing";
 }
 
