@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Arbitrary bytes from a network peer after its Hello: through decoder and requests to the
-// registry, its rings and the answers, in a real event loop. A second peer watches and subscribes,
-// and a program writes, so that events, gaps and full sockets occur. An input's first three bytes
-// choose whether the peer has the feature "torn", how its bytes are split, and how much it reads.
-// Then comes a bomb (bomb.hpp), which is sent last.
+// Arbitrary bytes from a network peer, after a Hello or with one of its own: through decoder and
+// requests to the registry, its rings and the answers, in a real event loop. A second peer watches
+// and subscribes, and a program writes, so that events, gaps and full sockets occur. An input's
+// first three bytes choose the Hello and whether it has the feature "torn", how the peer's bytes
+// are split, and how much it reads. Then comes a bomb (bomb.hpp), which is sent last.
 #include <netinet/in.h>
 
 #include <cstdlib>
@@ -36,6 +36,7 @@ void run(std::span<const std::uint8_t> input) {
   if (input.size() < 3) return;
   const bool torn = input[0] & 1;
   const bool large = input[0] & 2;
+  const bool greets = !(input[0] & 4);
   const std::size_t cut = 1U + input[1], room = input[2] * 100U;
   input = input.subspan(3);
   const Bytes bomb = to_bytes(fuzz::bomb_from(input));
@@ -66,7 +67,7 @@ void run(std::span<const std::uint8_t> input) {
   watcher.put(with_serial(2, subscribe_from_oldest_frame()));
   fuzzed.max_receive_bytes = cut;
   const wire::Greeting greeting = greeting_of("pc1", "fuzzer");
-  fuzzed.put(hello_frame(torn ? greeting : without_features(greeting)));
+  if (greets) fuzzed.put(hello_frame(torn ? greeting : without_features(greeting)));
   const auto bytes = std::as_bytes(input);
   fuzzed.put(Bytes(bytes.begin(), bytes.end()));
   fuzzed.put(bomb);
