@@ -146,6 +146,7 @@ class BlackBox {
   void report_notices() {
     for (const std::string& text : recorder_.take_notices()) notice(text);
     for (const std::string& text : watch_.take_notices()) notice(text);
+    for (const std::string& text : folder_.take_notices()) notice(text);
   }
 
   static void notice(const std::string& text) {

@@ -498,10 +498,16 @@ void check_black_box(const RecordOptions& options) {
 void check_record(RecordOptions& options) {
   require(!options.until || !options.until->back || *options.until->back == Duration::zero(),
           "--until: a time to come, as seconds since 1970 or ISO 8601");
+  require(!options.until || options.until->back || options.until->time > WallClock::now(),
+          "--until: that time is over; --for takes a duration");
   require(options.repair.empty() || options.patterns.empty(),
           "--repair takes one file, and nothing else");
   require(!options.follow || options.past,
           "--follow: only with --past, without which it continues anyway");
+  require(options.quota_bytes == 0 || options.quota_bytes >= RecordOptions::kMinQuotaBytes,
+          fmt::format("--quota: at least {}, for all recordings in the folder; is a unit missing, "
+                      "as in 20GiB?",
+                      bytes_text(RecordOptions::kMinQuotaBytes)));
   require(options.quota_bytes == 0 || options.max_file_bytes <= options.quota_bytes / 2,
           "--max-file-size: at most half of --quota, because the newest file is not deleted");
   check_black_box(options);

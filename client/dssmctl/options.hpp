@@ -125,6 +125,8 @@ struct RecordOptions : CommonOptions {
   std::string compression = "lz4";
   std::uint64_t max_file_bytes = 0, max_total_bytes = 0;  // 0: no limit
   Duration max_file_duration{};                           // 0: no limit
+  // Less is probably a number without its unit, and would delete all earlier recordings.
+  static constexpr std::uint64_t kMinQuotaBytes = 64U << 10;
   std::uint64_t quota_bytes = 0;  // of all recordings in the folder; 0: none
   // Of the black box.
   bool black_box = false;

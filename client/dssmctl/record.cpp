@@ -34,14 +34,29 @@ Result<void> check_folder(const std::filesystem::path& folder) {
                            escaped(folder.string()))};
 }
 
+bool is_folder(const std::string& path) {
+  std::error_code ignored;
+  return std::filesystem::is_directory(path, ignored);
+}
+
+// What needs a folder: recordings with names of their own are counted and deleted there.
+Result<void> check_output(const RecordOptions& options) {
+  const bool is_limited = options.black_box || options.quota_bytes > 0;
+  const std::filesystem::path output = options.file;
+  DSSM_TRY(check_folder(options.black_box || options.file.ends_with('/') ? output
+                                                                         : output.parent_path()));
+  if (!is_limited || options.file.empty() || is_folder(options.file)) return {};
+  return Error{Errc::invalid_argument,
+               fmt::format("{} names its recordings itself, in the folder of --output; '{}' is no "
+                           "folder (--max-total-size limits the files of one recording)",
+                           options.black_box ? "--black-box" : "--quota", escaped(options.file))};
+}
+
 std::filesystem::path file_of(const RecordOptions& options) {
   const std::string name = recording_name(WallClock::now());
   if (options.file.empty()) return name;
-  std::error_code ignored;
-  if (std::filesystem::is_directory(options.file, ignored)) {
-    return std::filesystem::path(options.file) / name;
-  }
-  return options.file;
+  return is_folder(options.file) ? std::filesystem::path(options.file) / name
+                                 : std::filesystem::path(options.file);
 }
 
 // Records until it is to end, and says how it goes: on a terminal in a line that is redrawn.
@@ -103,6 +118,7 @@ class RecordingRun {
 
   void report_notices() {
     for (const std::string& text : recorder_.take_notices()) notice(text);
+    for (const std::string& text : folder_.take_notices()) notice(text);
   }
 
   void report_undescribed() {
@@ -179,9 +195,7 @@ Json recording_json(const std::filesystem::path& file, const Recorder& recorder)
 
 Result<void> run(const RecordOptions& options, Output& out) {
   if (!options.repair.empty()) return repair(options, out);
-  const bool is_folder = options.black_box || options.file.ends_with('/');
-  const std::filesystem::path output = options.file;
-  DSSM_TRY(check_folder(is_folder ? output : output.parent_path()));
+  DSSM_TRY(check_output(options));
   Session session = DSSM_TRY(connect(options));
   RecordingOptions how;
   how.compression = compression_of(options.compression);

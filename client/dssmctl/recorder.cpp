@@ -66,12 +66,16 @@ Result<void> Recorder::Opener::begin() {
   return {};
 }
 
+// A type without a name may get one when its stream is opened.
 bool Recorder::Opener::wants(const StreamInfo& stream) const {
   return plan_.filter.takes(stream.id) &&
-         (plan_.types.empty() ||
-          std::any_of(plan_.types.begin(), plan_.types.end(), [&](const std::string& type) {
-            return ::fnmatch(type.c_str(), stream.type.name.c_str(), 0) == 0;
-          }));
+         (stream.type.name.empty() || wants_type(stream.type.name));
+}
+
+bool Recorder::Opener::wants_type(const std::string& name) const {
+  return plan_.types.empty() || std::ranges::any_of(plan_.types, [&](const std::string& type) {
+           return ::fnmatch(type.c_str(), name.c_str(), 0) == 0;
+         });
 }
 
 void Recorder::Opener::on_event(const StreamEvent& event) {
@@ -87,7 +91,12 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
       want_property(
           {event.stream, is_new ? std::optional(kNoTid) : std::nullopt, MonoClock::now()});
     }
-    if (known != known_.end()) known->second = event.stream.incarnation;
+    if (known != known_.end()) {
+      known->second = event.stream.incarnation;
+      if (!event.stream.type.fields.empty()) {
+        described_.insert_or_assign(event.stream.id.str(), event.stream.type);
+      }
+    }
   }
   const auto is_it = [&](const Wanted& wanted) { return wanted.stream.id == event.stream.id; };
   std::erase_if(removed_, [&](const auto& entry) { return entry.first == event.stream.id; });
@@ -166,8 +175,10 @@ std::vector<StreamId> Recorder::Opener::take_removed(Duration age) {
 
 void Recorder::Opener::reopen(const StreamId& id, const Error& error) {
   const std::lock_guard lock(mutex_);
-  notices_.push_back(
-      fmt::format("'{}' is opened again: {}", escaped(id.str()), escaped_message(error.message)));
+  notices_.push_back(fmt::format("'{}' is opened again: {}", escaped(id.str()),
+                                 error.code == Errc::type_mismatch
+                                     ? "its samples are of another type now"
+                                     : escaped_message(error.message)));
   known_.erase(id.str());
   Wanted wanted;
   wanted.stream.id = id;
@@ -212,6 +223,10 @@ void Recorder::Opener::run() {
     });
     const bool is_wanted = entry != wanted_.end();
     if (is_wanted && entry->from_start && !entry->reported) --untried_;
+    if (opened && !wants_type(opened->type().name)) {  // until it is described, maybe
+      if (is_wanted) wanted_.erase(entry);
+      continue;
+    }
     if (opened) {  // the reader has the samples of its ring, and follows a new one
       known_[wanted.stream.id.str()] = wanted.stream.incarnation;
       if (is_wanted) wanted_.erase(entry);
@@ -244,8 +259,12 @@ Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
   Source source{std::move(reader), 0, kNoTid, kNoTid, {}, {}, true, {}, {}, {}};
   if (property) source.property = *std::move(property);
   const Tid newest = source.reader.newest_tid();
-  // The stamps of a recording that is being played are of another time than now.
-  source.is_of_now = wanted.stream.state != StreamState::unknown;
+  // The stamps of a recording that is being played are of another time than now. What lists say of
+  // another host's stream is without its state.
+  if (wanted.stream.state == StreamState::unknown) {
+    const Result<StreamInfo> now = session.stream_info(wanted.stream.id);
+    source.is_of_now = !now || now->state != StreamState::unknown;
+  }
   if (!with_history) {
     // What was written since the recording began, if dssmd said what was there then.
     const StreamInfo& then = wanted.stream;
@@ -287,6 +306,11 @@ std::vector<std::pair<StreamId, Recorder::NewProperty>> Recorder::Opener::take_p
   return std::exchange(properties_, {});
 }
 
+std::map<std::string, TypeInfo> Recorder::Opener::take_described() {
+  const std::lock_guard lock(mutex_);
+  return std::exchange(described_, {});
+}
+
 std::vector<std::string> Recorder::Opener::take_notices() {
   const std::lock_guard lock(mutex_);
   return std::exchange(notices_, {});
@@ -317,6 +341,7 @@ Result<void> Recorder::begin(RecordingWriter file, Duration before) {
   before_ = before;
   past_moved_ = MonoClock::now();
   period_ = kMinPeriod;
+  take_descriptions();
   for (Source& source : sources_) {
     want_past(source);
     if (Result<void> added = add_to_file(source); !added) {
@@ -353,6 +378,7 @@ Result<void> Recorder::take_until(Time held_from) {
     if (Result<void> one = add(std::move(opened)); !one && added) added = std::move(one);
   }
   for (auto& [id, property] : properties) add_property(id, std::move(property));
+  take_descriptions();
   DSSM_TRY(std::move(added));
   if (!is_recording_) {
     check_readers();
@@ -409,6 +435,15 @@ Result<void> Recorder::add_to_file(Source& source) {
       DSSM_TRY(file_->add_stream({reader.id(), source.type(), reader.depth(), reader.cycle(),
                                   reader.incarnation(), source.property}));
   return {};
+}
+
+// A file that has begun keeps its channels; the next one has the fields.
+void Recorder::take_descriptions() {
+  for (auto& [name, type] : opener_.take_described()) {
+    const auto source =
+        std::ranges::find(sources_, name, [](const Source& one) { return one.reader.id().str(); });
+    if (source != sources_.end()) source->obvious = std::move(type);
+  }
 }
 
 void Recorder::add_property(const StreamId& id, NewProperty property) {

@@ -147,7 +147,8 @@ class Recorder {
     bool is_of_now = true;            // its stamps are of this time, and not of one that is played
     std::vector<std::byte> property;  // that the file has, or gets at its beginning
     std::vector<NewProperty> new_properties;  // the file has not yet
-    TypeInfo obvious;                         // obvious_type_of_programs(), if it is not described
+    // If it was not described when it was opened: as it was since, or obvious_type_of_programs().
+    TypeInfo obvious;
 
     const TypeInfo& type() const { return type_to_show(reader.type(), obvious); }
   };
@@ -174,6 +175,8 @@ class Recorder {
     std::vector<Source> take_opened();
     // To be called before take_opened(), which then has their streams.
     std::vector<std::pair<StreamId, NewProperty>> take_properties();
+    // Types of streams that are open, by their names: described, maybe, since they were opened.
+    std::map<std::string, TypeInfo> take_described();
     std::vector<std::string> take_notices();
     bool has_tried_all() const;  // of the streams that there were at begin()
 
@@ -195,6 +198,7 @@ class Recorder {
     // The one to try next; the end: none.
     std::vector<Wanted>::iterator next_wanted();
     bool wants(const StreamInfo& stream) const;
+    bool wants_type(const std::string& name) const;
     void on_event(const StreamEvent& event);
     void run();
     Result<Source> open(const Wanted& wanted) const;
@@ -216,6 +220,7 @@ class Recorder {
     std::vector<Source> opened_;
     std::vector<SetProperty> set_properties_;                   // the last change of each stream
     std::vector<std::pair<StreamId, NewProperty>> properties_;  // fetched
+    std::map<std::string, TypeInfo> described_;                 // by name, since they were opened
     std::vector<std::string> notices_;
     std::optional<MonoTime> stop_at_;
 
@@ -233,6 +238,7 @@ class Recorder {
   Duration next_period();
   Result<void> add(Source source);
   Result<void> add_to_file(Source& source);
+  void take_descriptions();
   void want_past(Source& source) const;
   // take(); samples that are later than `held_from` may wait for earlier ones of other streams.
   Result<void> take_until(Time held_from);

@@ -12,6 +12,7 @@
 #include <tuple>
 #include <vector>
 
+#include "client/dssmctl/text.hpp"
 #include "core/base/try.hpp"
 
 namespace dssm::ctl {
@@ -105,6 +106,8 @@ Result<void> RecordingFolder::make_room(std::uint64_t written_bytes) {
                           error);
     }
     total -= files[i].bytes;
+    notices_.push_back(
+        fmt::format("'{}' is deleted, because of --quota", escaped(files[i].path.string())));
   }
   return {};
 }

@@ -10,6 +10,8 @@
 #include <optional>
 #include <string>
 #include <string_view>
+#include <utility>
+#include <vector>
 
 namespace dssm::ctl {
 
@@ -37,6 +39,9 @@ class RecordingFolder {
   //                  deleted)
   Result<void> make_room(std::uint64_t written_bytes);
 
+  // What was deleted since the last call, for people.
+  std::vector<std::string> take_notices() { return std::exchange(notices_, {}); }
+
   // Completes the newest recording if its writer was killed.
   //   returns  its path; empty: there was nothing to do
   //   fails    as repair_recording() and make_room()
@@ -46,6 +51,7 @@ class RecordingFolder {
   std::filesystem::path folder_;
   std::uint64_t quota_bytes_;
   std::optional<std::uint64_t> checked_at_bytes_;
+  std::vector<std::string> notices_;
 };
 
 }  // namespace dssm::ctl

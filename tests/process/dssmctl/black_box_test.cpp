@@ -226,7 +226,13 @@ TEST_F(BlackBox, IsTriggeredByAFieldThatIsDescribedLater) {
   await([&] { return session_.stream_info(power.id()).value().readers == 2; });
   const Power low{21.25, 0};
   power.write(std::as_bytes(std::span(&low, 1)));
-  EXPECT_TRUE(contains(running.line(), "volts of 'power:0@pc1' is 21.25; "));
+  const std::string line = running.line();
+  EXPECT_TRUE(contains(line, "volts of 'power:0@pc1' is 21.25; ")) << line;
+  // What was opened without fields has them in the next file.
+  const std::string file = quoted_file(line);
+  EXPECT_TRUE(running.line().starts_with(file));
+  const Recording recording = Recording::open(file).value();
+  EXPECT_EQ(recording.open_reader<Power>("power").value().type(), type_of<Power>());
 }
 
 TEST_F(BlackBox, IsTriggeredByAStreamThatStalls) {
@@ -409,15 +415,22 @@ TEST_F(BlackBox, KeepsTheQuotaOverRestartsAndLeavesOtherFilesAlone) {
   auto power = std::optional(session_.create<Power>("power", depth_of(20'000)).value());
   std::ofstream(folder_.file("mine.mcap")) << std::string(100'000, 'x');
   constexpr std::uintmax_t kQuota = 1'000'000;
-  std::vector<std::string> files;
+  std::vector<std::string> files, deleted;
   for (int i = 0; i < 6; ++i) {  // each more than a fifth of the quota
     Running running(recorder({"--after", "1ms", "--compression", "none", "--quota", "1000000"}),
                     environment());
     await_armed(power->id());
     write_power(*power, i * 5'000, i * 5'000 + 4'999);
     output({"trigger", "number_" + std::to_string(i)});
-    files.push_back(quoted_file(running.line()));
-    EXPECT_TRUE(running.line().starts_with(files.back()));
+    const auto next_line = [&] {
+      std::string line;
+      while ((line = running.line()).ends_with(" is deleted, because of --quota")) {
+        deleted.push_back(quoted_file(line));
+      }
+      return line;
+    };
+    files.push_back(quoted_file(next_line()));
+    EXPECT_TRUE(next_line().starts_with(files.back()));
     running.signal(SIGTERM);
     EXPECT_EQ(running.status(), 0);
     ASSERT_TRUE(session_.remove(power->id()));  // what it has is in a file
@@ -433,6 +446,8 @@ TEST_F(BlackBox, KeepsTheQuotaOverRestartsAndLeavesOtherFilesAlone) {
   EXPECT_LE(total, kQuota);
   EXPECT_GE(total, kQuota / 4);
   EXPECT_FALSE(std::filesystem::exists(files.front()));
+  ASSERT_FALSE(deleted.empty());
+  EXPECT_EQ(deleted.front(), files.front());
   EXPECT_TRUE(std::filesystem::exists(files.back()));
   EXPECT_TRUE(std::filesystem::exists(folder_.file("mine.mcap")));
 }

@@ -331,6 +331,13 @@ TEST_F(Record, KeepsTheQuotaOfItsFolder) {
   EXPECT_EQ(Recording::open(folder_.path()).value().streams()[0].last_tid, 199);
 }
 
+TEST_F(Record, TakesAQuotaOnlyForAFolder) {
+  const Finished refused = ctl({"record", "--quota", "1MiB", "-o", file_});
+  EXPECT_EQ(refused.exit_status, 2);
+  EXPECT_TRUE(contains(refused.err, "'" + file_ + "' is no folder")) << refused.err;
+  EXPECT_FALSE(std::filesystem::exists(file_));
+}
+
 TEST_F(Record, InfoTakesNamesWithASlashForStreams) {
   const auto pose = session_.create<RecordedPose>("robot/pose", depth_of(4)).value();
   EXPECT_TRUE(contains(output({"info", "robot/pose"}), "robot/pose"));
@@ -1071,6 +1078,16 @@ TEST_F(PlayFleet, FollowsAPlayerAndForgetsOneThatIsGone) {
   killed.status();
   await([&] { return there_.setting() == PlaybackClock::Setting{}; });
   await([&] { return here_.setting() == PlaybackClock::Setting{}; });
+}
+
+TEST_F(RecordFleet, CountsThePastOfAnotherHostFromNow) {
+  auto there = on_pc2_.create<RecordedPose>("there", depth_of(1024)).value();
+  await_streams(1);
+  const Time now = WallClock::now();
+  for (int i = 0; i < 100; ++i) there.write({0, 0, i}, now - 5s + i * 1ms);
+  const std::string text =
+      output({"record", "--past", "1s", "there", "-o", folder_.file("a.mcap")});
+  EXPECT_TRUE(contains(text, ": 0 samples of 1 stream")) << text;
 }
 
 TEST_F(RecordFleet, TakesThePastOfAllHosts) {

@@ -114,6 +114,12 @@ TEST_F(Describe, EchoPlotAndRecordKnowTheFieldsOfAProgramThatRuns) {
   EXPECT_THAT(record.err, HasSubstr("'spur_odometry:3@pc1' is recorded as "));
   EXPECT_THAT(record.err, Not(HasSubstr("without descriptions")));
   EXPECT_THAT(ctl({"info", "--json", recording}).out, HasSubstr("theta"));
+  for (const auto& [type, streams] : {std::pair("Spur_Odo*", 1), std::pair("Lidar*", 0)}) {
+    const Finished some = ctl({"record", "--past", "1h", "--type", type, "-o",
+                               folder + "/" + std::to_string(streams) + ".mcap"});
+    EXPECT_EQ(some.exit_status, 0) << some.err;
+    EXPECT_THAT(some.out, HasSubstr(streams ? "1 sample of 1 stream," : "0 samples of 0 streams,"));
+  }
   EXPECT_TRUE(session.stream_info(kStream)->type.fields.empty()) << "they change nothing";
 }
 

@@ -106,6 +106,8 @@ TEST(CommandLine, RefusesARecordingThatCannotBeMeant) {
   expect({"record", "--max-file-size", "1GB"}, "'1GB' is not a size");
   expect({"record", "--compression", "gzip"}, "there are lz4, zstd and none");
   expect({"record", "--until", "-3s"}, "a time to come");
+  expect({"record", "--until", "1700000000"}, "that time is over");
+  expect({"record", "--quota", "20"}, "is a unit missing");
   expect({"record", "--until", "now", "--for", "1s"}, "excludes");
 }
 

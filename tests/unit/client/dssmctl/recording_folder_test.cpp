@@ -64,11 +64,16 @@ TEST_F(RecordingFolderTest, DeletesTheOldestOfItsOwnFiles) {
   EXPECT_EQ(files(), expected);
   // Little was written since; then enough.
   add("incident_2026_11_27-14_00_00_b.mcap", 300, 0h);
+  static_cast<void>(folder.take_notices());
   ASSERT_TRUE(folder.make_room(9));
   EXPECT_EQ(files().size(), 6U);
+  EXPECT_TRUE(folder.take_notices().empty());
   ASSERT_TRUE(folder.make_room(10));
   EXPECT_EQ(files().size(), 5U);
-  EXPECT_FALSE(fs::exists(path_ / "incident_2026_11_26-12_00_00_a.mcap"));
+  const fs::path deleted = path_ / "incident_2026_11_26-12_00_00_a.mcap";
+  EXPECT_FALSE(fs::exists(deleted));
+  EXPECT_EQ(folder.take_notices(),
+            std::vector<std::string>{"'" + deleted.string() + "' is deleted, because of --quota"});
 }
 
 TEST_F(RecordingFolderTest, NeverDeletesTheNewest) {
