@@ -331,8 +331,10 @@ class SSMApiBase {
   }
   bool isNewer(SSM_tid top) const { return top >= 0 && (timeId < 0 || isBefore(timeId, top)); }
 
+  // Samples of size 0 have an address, too; a program that copies samples itself may set a size
+  // alone.
   bool hasBuffer(const char* function) const {
-    if (mDataSize > 0) return true;
+    if (mData != 0 || mDataSize > 0) return true;
     std::cerr << "SSM::" << function << "() : data buffer of '" << getStreamName()
               << "', id = " << streamId << " is not set" << std::endl;
     return false;

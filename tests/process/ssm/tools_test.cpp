@@ -247,6 +247,40 @@ TEST_F(SsmLogger, WaitsForItsStreamAndEndsCleanlyByTwoSignals) {
   EXPECT_EQ(recorded(), 0U);
 }
 
+// Of size 0 is a stream that carries only times; libssm gives it this type.
+TEST_F(SsmLogger, RecordsAStreamOfSizeZeroThatThePlayerPlays) {
+  const StreamId tick{"tick", 0, {}};
+  const std::vector<std::int64_t> times_ns = {1'000'500'000'000, 1'001'000'000'000};
+  RawWriter writer =
+      session.create_raw(tick, {"ssm.empty", 1, 1, {}}, History{kSlots, 50ms}).value();
+  PipedProgram logger({ssm_tool("ssm-logger"), "-l", log, "-n", "tick"}, daemon.environment(),
+                      true);
+  EXPECT_EQ(logger.line(), "open stream 'tick' [0].");
+  await([&] { return std::filesystem::exists(log); });
+  for (const std::int64_t time_ns : times_ns) {
+    writer.write(std::vector<std::byte>(1), time_from_ns(time_ns));
+  }
+  ::kill(logger.pid(), SIGINT);
+  std::string text;
+  EXPECT_EQ(logger.end(text), 0) << text;
+  EXPECT_EQ(text, "2 samples recorded.\n");
+
+  const DaemonProcess other({"--log-level", "warning"});
+  const Finished played = run({ssm_tool("ssm-player"), "-x", "1000", log}, {other.environment()});
+  ASSERT_EQ(played.exit_status, 0) << played.out << played.err;
+  Session replayed = connect(other);
+  RawReader reader = replayed.open_raw_reader(tick).value();
+  EXPECT_EQ(reader.type(), (TypeInfo{"ssm.empty", 1, 1, {}}));
+  std::vector<std::int64_t> played_ns;
+  for (Tid tid = 0; tid <= reader.newest_tid(); ++tid) {
+    std::byte nothing{};
+    SampleInfo info;
+    EXPECT_EQ(reader.read_tid(tid, std::span(&nothing, 1), info), ReadStatus::ok);
+    played_ns.push_back(to_ns(info.time));
+  }
+  EXPECT_EQ(played_ns, times_ns);
+}
+
 TEST_F(SsmLogger, ExitsWith255WhenItCannotRecord) {
   const RawWriter writer = create_odometry();
   const std::vector<std::vector<std::string>> wrong = {

@@ -275,6 +275,25 @@ void plain_base() {
   free(property);
 }
 
+// With the address of a buffer, as a generic tool has one.
+void size_zero() {
+  char buffer = 'u';
+  SSMApiBase writer("size_zero", 0), reader("size_zero", 0);
+  writer.setBuffer(&buffer, 0, NULL, 0);
+  reader.setBuffer(&buffer, 0, NULL, 0);
+  CHECK(writer.create(1.0, 0.1) && reader.open() && reader.openWait(1.0));
+  CHECK(writer.write(12.5) && writer.write(13.5));
+  CHECK(reader.readTime(12.5) && reader.timeId == 0);
+  CHECK(reader.readNext() && reader.timeId == 1);
+  CHECK_SAME(reader.time, 13.5);
+  CHECK(buffer == 'u');
+  SSMApi<char> wrong("size_zero", 0);
+  catch_stderr();
+  const bool opened = wrong.open();
+  CHECK_TEXT(caught_stderr(), "has 0 bytes per sample, this program's type 1");
+  CHECK(!opened);
+}
+
 void pack(void* ssmp, const void* data, void*) { memcpy(ssmp, data, 12); }
 void unpack(const void* ssmp, void* data, void* user) {
   memcpy(data, ssmp, 12);
@@ -318,6 +337,7 @@ int main(int argc, char** argv) {
   properties();
   other_sizes();
   plain_base();
+  size_zero();
   variable_size();
   CHECK_EQUAL(endSSM(), 1);
   return check_result();
