@@ -113,7 +113,7 @@ Result<std::pair<SsmLogHead, std::string>> log_head(const RecordedStreamInfo& st
   head.stream_name = stream.id.name;
   head.stream_id = stream.id.id;
   head.buffer_num = static_cast<std::int32_t>(std::clamp(stream.depth, kMinDepth, kMaxDepth));
-  head.data_bytes = stream.type.payload_bytes;
+  head.data_bytes = stream.type.name == kEmptySsmType ? 0 : stream.type.payload_bytes;
   head.property_bytes = stream.property.size();
   head.cycle_s = seconds_from_ns(to_ns(stream.cycle));
   head.start_time_s = seconds_from_ns(to_ns(stream.first_time));

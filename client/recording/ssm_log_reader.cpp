@@ -20,8 +20,6 @@ namespace {
 
 constexpr std::uint64_t kChunkBytes = 1U << 20;
 constexpr std::uint16_t kChannel = 1;
-// libssm's name of the type of a stream whose samples have no bytes; its ring has one.
-constexpr const char* kEmptyType = "ssm.empty";
 
 // nullopt: no time of a sample.
 std::optional<std::int64_t> sample_time_ns(double seconds) {
@@ -34,7 +32,7 @@ RecordedStream stream_of_log(const SsmLogHead& head, std::string_view line) {
   RecordedStream stream;
   stream.id = {head.stream_name, head.stream_id, ""};
   stream.type = {"", head.data_bytes, 1, {}};
-  if (head.data_bytes == 0) stream.type = {kEmptyType, 1, 1, {}};
+  if (head.data_bytes == 0) stream.type = {kEmptySsmType, 1, 1, {}};
   stream.depth = static_cast<std::uint64_t>(std::max(head.buffer_num, 0));
   stream.cycle = Duration(std::max<std::int64_t>(ns_from_seconds(head.cycle_s), 1));
   stream.incarnation = static_cast<std::uint64_t>(ns_from_seconds(head.start_time_s));

@@ -19,6 +19,10 @@ inline constexpr std::uint64_t kMaxSsmLogSize = INT32_MAX;  // SSM's sizes are i
 // In the metadata of a recorded stream: the first line of the log that it comes from.
 inline constexpr const char* kSsmLogKey = "ssm_log";
 
+// Type name of a stream whose samples have no bytes, as libssm creates it; its ring has one byte,
+// as rings must.
+inline constexpr const char* kEmptySsmType = "ssm.empty";
+
 // What the first line says.
 struct SsmLogHead {
   std::string stream_name;

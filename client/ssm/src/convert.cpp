@@ -67,7 +67,7 @@ TypeInfo type_for(std::size_t bytes) {
   TypeInfo type;
   type.payload_bytes = bytes;
   if (bytes > 0) return type;
-  type.name = kEmptyType;
+  type.name = kEmptySsmType;
   type.payload_bytes = 1;
   return type;
 }

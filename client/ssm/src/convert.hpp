@@ -14,6 +14,7 @@
 #include <string_view>
 
 #include "core/base/seconds.hpp"
+#include "core/base/ssm_log.hpp"
 
 namespace dssm::ssm {
 
@@ -39,15 +40,12 @@ std::string property_size_error(const std::string& quoted_name, std::size_t prop
 // Of valid arguments.
 History history_of(double life, double cycle) noexcept;
 
-// Type name of a stream created with size 0; its ring has one byte, as rings must.
-inline constexpr const char* kEmptyType = "ssm.empty";
-
 // The type of a stream of `bytes` per sample.
 TypeInfo type_for(std::size_t bytes);
 
 // Bytes per sample as SSM programs see it.
 inline std::uint64_t data_bytes(const TypeInfo& type) noexcept {
-  return type.name == kEmptyType ? 0 : type.payload_bytes;
+  return type.name == kEmptySsmType ? 0 : type.payload_bytes;
 }
 
 // --- tids

@@ -107,6 +107,27 @@ TEST_F(Convert, OfARecordingGivesLogsThatSsmReads) {
             "pose 0 8 16 0.020000 1795250129.500000 2\nab" + record);
 }
 
+// A ring has at least one byte per sample, so a recording says one where a log says none.
+TEST_F(Convert, OfARecordingOfAStreamOfSizeZeroGivesItsLog) {
+  RecordingWriter writer = RecordingWriter::create(file("a.mcap")).value();
+  RecordedStream stream;
+  stream.id = {"tick", 0, "pc1"};
+  stream.type = {"ssm.empty", 1, 1, {}};
+  stream.depth = 16;
+  stream.cycle = 20ms;
+  const auto tick = writer.add_stream(stream).value();
+  const std::vector<std::byte> one(1);
+  ASSERT_TRUE(writer.write(tick, {0, time_from_ns(1000'500'000'000), 5ns, 1}, 5ns, one));
+  ASSERT_TRUE(writer.finish());
+  output({"convert", file("a.mcap"), file("a.log")});
+  const double time = 1000.5;
+  std::string record(8, '\0');
+  std::memcpy(record.data(), &time, 8);
+  EXPECT_EQ(content_of(file("a.log")), "tick 0 0 16 0.020000 1000.500000 0\n" + record);
+  output({"convert", file("a.log"), file("b.mcap")});
+  EXPECT_EQ(Recording::open(file("b.mcap")).value().streams()[0].type, stream.type);
+}
+
 TEST_F(Convert, RefusesWhatWouldLoseSomething) {
   const std::string a = save("a.log", "a 0 8 10 0.1 1000 0\n" + records(3, 8, 1));
   const std::string b = save("b.log", "b 0 8 10 0.1 1000 0\n" + records(3, 8, 2));
