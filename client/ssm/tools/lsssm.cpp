@@ -7,7 +7,8 @@
 
 using namespace dssm::ssm_tools;
 
-int main() {
+int main(int argc, char** argv) {
+  if (prints_help(argc, argv, "prints a table of the streams of this PC")) return 0;
   if (!connect()) return 1;
   const auto streams = list_streams();
   if (!streams) return 1;

@@ -33,7 +33,9 @@ std::string program_of(int pid) {
 
 }  // namespace
 
-int main() {
+int main(int argc, char** argv) {
+  if (prints_help(argc, argv, "prints the SSM programs and the streams between them, for dot(1)"))
+    return 0;
   if (!connect()) return 1;
   std::printf(
       "digraph ssm {\n\tgraph [ rankdir = LR ];\n\tnode [ shape = box, style = filled ];\n");

@@ -51,7 +51,9 @@ class Watched {
 
 }  // namespace
 
-int main() {
+int main(int argc, char** argv) {
+  if (prints_help(argc, argv, "shows what is written to each stream of this PC, until Ctrl-C"))
+    return 0;
   if (!connect()) return 1;
   end_on_signals();
   std::vector<Watched> watched;

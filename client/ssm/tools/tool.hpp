@@ -30,6 +30,17 @@ namespace dssm::ssm_tools {
   std::fputc('\n', stderr);
 }
 
+// Whether -h or --help is among the arguments; prints the usage then. For tools without options,
+// which ignore all other arguments, as SSM's do.
+inline bool prints_help(int argc, char** argv, const char* what_it_does) {
+  for (int i = 1; i < argc; ++i) {
+    if (std::strcmp(argv[i], "-h") != 0 && std::strcmp(argv[i], "--help") != 0) continue;
+    std::printf("usage: %s\n  %s\n", ::program_invocation_short_name, what_it_does);
+    return true;
+  }
+  return false;
+}
+
 // Registers this program with dssmd; false, with a message, when there is none. libssm says why.
 inline bool connect() {
   if (initSSM()) return true;

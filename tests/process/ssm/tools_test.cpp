@@ -407,6 +407,24 @@ TEST_F(SsmTools, FailWithoutDssmd) {
   }
 }
 
+// Without dssmd, which they do not ask then. killssm is tried below, among programs of its own.
+TEST_F(SsmTools, PrintTheirUsageAndDoNothingElse) {
+  for (const char* name : {"psssm", "topssm"}) {
+    std::filesystem::create_symlink(script("psssm"), folder + "/" + name);
+  }
+  for (const char* option : {"-h", "--help"}) {
+    for (const std::string& tool :
+         {ssm_tool("lsssm"), ssm_tool("ssm-monitor"), ssm_tool("ssm-graph"), folder + "/psssm",
+          folder + "/topssm", script("ssm-transporter")}) {
+      const Finished finished = run({tool, option}, {"DSSM_SOCKET=" + folder + "/dssmd.sock"});
+      EXPECT_EQ(finished.exit_status, 0) << tool;
+      EXPECT_EQ(finished.out.find("usage: " + std::filesystem::path(tool).filename().string()), 0U)
+          << finished.out;
+      EXPECT_EQ(finished.err, "") << tool;
+    }
+  }
+}
+
 TEST_F(SsmTools, LsssmPrintsTheOldTable) {
   RawWriter one = session.create_raw({"wtest", 2, {}}, {"", 16, 1, {}}, History{49, 50ms}).value();
   ASSERT_TRUE(one.set_property(std::vector<std::byte>(32)));
@@ -557,6 +575,9 @@ TEST_F(SsmTools, KillssmEndsProgramsAndTheCoordinatorButNoDssmd) {
         [ -n "$(cat /proc/$coordinator/task/$coordinator/children)" ]; do sleep 0.01; done
     psssm | grep -c dssmd
     topssm -b -n 1 -w 200 | grep -c ssm-monitor
+    killssm --help | head -n 1
+    killssm -l; echo "refused $?"
+    psssm | grep -c ssm-monitor
     killssm
     wait $monitor; echo "monitor $?"
     wait $coordinator; echo "coordinator $?"
@@ -569,7 +590,9 @@ TEST_F(SsmTools, KillssmEndsProgramsAndTheCoordinatorButNoDssmd) {
   const Finished finished = run(
       words,
       {daemon.environment(), "LD_LIBRARY_PATH=" + built("client/ssm") + ":" + built("client/src")});
-  EXPECT_EQ(finished.out, "0\n1\nmonitor 0\ncoordinator 0\ndssmd runs\npsssm 1\n") << finished.err;
+  EXPECT_EQ(finished.out,
+            "0\n1\nusage: killssm\nrefused 1\n1\nmonitor 0\ncoordinator 0\ndssmd runs\npsssm 1\n")
+      << finished.err;
 }
 
 }  // namespace
