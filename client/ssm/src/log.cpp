@@ -50,6 +50,7 @@ struct dssm_ssm_log {
   std::uint64_t next = 0;  // reading: the number of the next record
   bool at_end = false;     // the last read found no record
   // What find() knows of the times of the first `scanned` records: they rise, but for these places.
+  // A NaN is a run of its own.
   std::vector<std::uint64_t> runs = {0};
   std::uint64_t scanned = 0;
   double last_scanned = -std::numeric_limits<double>::infinity();
@@ -134,7 +135,7 @@ void scan_times(dssm_ssm_log& log, std::uint64_t count) {
     for (std::uint64_t i = 0; i < n; ++i) {
       double time = 0;
       std::memcpy(&time, &block[i * step], sizeof time);
-      if (time < log.last_scanned) log.runs.push_back(log.scanned + i);
+      if (!(time >= log.last_scanned)) log.runs.push_back(log.scanned + i);
       log.last_scanned = time;
     }
     log.scanned += n;

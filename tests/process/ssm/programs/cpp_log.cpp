@@ -138,6 +138,7 @@ unsigned expected_at(const std::vector<double>& times, double time) {
 }
 
 void records_are_found_by_time() {
+  const double kNoTimes[] = {kInfinity, -kInfinity, std::numeric_limits<double>::quiet_NaN()};
   const unsigned seed = static_cast<unsigned>(getpid());
   srand(seed);
   printf("seed %u\n", seed);
@@ -149,6 +150,7 @@ void records_are_found_by_time() {
       time += rand() % 4;
       if (falls && rand() % (20 * falls) == 0) time -= rand() % 50;
       times.push_back(time);
+      if (round % 2 && rand() % 20 == 0) times.back() = kNoTimes[rand() % 3];
     }
     save(path("times.log"), log_of(times));
     SSMLog<Odometry, int> log;
