@@ -6,7 +6,6 @@
 #include <fmt/format.h>
 
 #include <algorithm>
-#include <cmath>
 #include <cstring>
 
 #include "client/recording/file_reader.hpp"
@@ -20,13 +19,6 @@ namespace {
 
 constexpr std::uint64_t kChunkBytes = 1U << 20;
 constexpr std::uint16_t kChannel = 1;
-
-// nullopt: no time of a sample.
-std::optional<std::int64_t> sample_time_ns(double seconds) {
-  const std::int64_t ns = ns_from_seconds(seconds);
-  if (std::isnan(seconds) || ns == INT64_MAX || ns == INT64_MIN) return std::nullopt;
-  return ns;
-}
 
 RecordedStream stream_of_log(const SsmLogHead& head, std::string_view line) {
   RecordedStream stream;
@@ -110,11 +102,10 @@ void FileReader::decode_records(LoadedChunk& chunk, const IndexedChunk& about) c
   for (std::uint64_t at = 0; at + record_bytes <= chunk.data.size(); at += record_bytes) {
     double seconds = 0;
     std::memcpy(&seconds, chunk.data.data() + at, sizeof seconds);
-    const std::optional<std::int64_t> time_ns = sample_time_ns(seconds);
-    if (!time_ns) continue;
+    if (!is_sample_time(seconds)) continue;
     Message message;
     message.tid = static_cast<Tid>(first + at / record_bytes);
-    message.time_ns = *time_ns;
+    message.time_ns = ns_from_seconds(seconds);
     message.clock_error_ns = message.clock_bound_ns = to_ns(kUnknownClockError);
     message.offset = static_cast<std::uint32_t>(at + sizeof seconds);
     message.payload_bytes = static_cast<std::uint32_t>(log_->data_bytes);

@@ -28,6 +28,13 @@ inline std::int64_t ns_from_seconds(double seconds) noexcept {
   return whole * kSecondNs + static_cast<std::int64_t>(rest_ns + 0.5);
 }
 
+// Whether a sample can have this time: not NaN, and within 64 bits of nanoseconds.
+inline bool is_sample_time(double seconds) noexcept {
+  const std::int64_t ns = ns_from_seconds(seconds);
+  return !std::isnan(seconds) && ns != std::numeric_limits<std::int64_t>::max() &&
+         ns != std::numeric_limits<std::int64_t>::min();
+}
+
 // The double nearest to that many nanoseconds.
 inline double seconds_from_ns(std::int64_t ns) noexcept {
   constexpr std::int64_t kExact = std::int64_t{1} << 53;  // up to here the quotient rounds once

@@ -6,7 +6,8 @@
 // Each Track has one record in its buffer that is to be written next: the first one whose time the
 // clock has not reached yet, in the direction of play. The records of all tracks are written in the
 // order of their times. The clock may be changed by others at any moment (ssm-date, dssmctl
-// playback), so it is asked again at least every 10 ms.
+// playback), so it is asked again at least every 10 ms. Records with a time that no sample can have
+// are left out: the clock would never reach them.
 //
 // All is opened before the clock is touched, and the clock is reset however the player ends, except
 // by SIGKILL. Standard input is read only where poll(2) has something; its flags stay as they are.
@@ -22,6 +23,7 @@
 #include <ssm-log.hpp>
 #include <sstream>
 
+#include "core/base/seconds.hpp"
 #include "tool.hpp"
 
 using namespace dssm::ssm_tools;
@@ -29,7 +31,6 @@ using namespace dssm::ssm_tools;
 namespace {
 
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
-constexpr double kGreatest = std::numeric_limits<double>::max();
 
 void print_help() {
   std::fprintf(stderr,
@@ -103,6 +104,7 @@ class Track {
  public:
   // Opens the log; false, with a message, when it cannot be played.
   bool open(const char* file_name) {
+    file_name_ = file_name;
     if (!log_.open(file_name)) return false;
     data_.resize(log_.dataSize() + 1);  // an address also for samples of 0 bytes
     property_.resize(log_.propertySize() + 1);
@@ -130,10 +132,7 @@ class Track {
   // none.
   double next_time(bool reverse) {
     turn(reverse);
-    // A log may hold any time, also an infinite one.
-    return has_next_ ? std::clamp(log_.time(), -kGreatest, kGreatest)
-           : reverse ? -kInfinity
-                     : kInfinity;
+    return has_next_ ? log_.time() : reverse ? -kInfinity : kInfinity;
   }
 
   // Writes that record and takes the next one. False: the stream cannot be written.
@@ -144,21 +143,46 @@ class Track {
   }
 
   // The first record of the log becomes the next one.
-  void begin() { reverse_ = false, has_next_ = log_.readTime(-kInfinity); }
+  void begin() {
+    reverse_ = false;
+    has_next_ = skip_unusable(log_.readTime(-kInfinity), false);
+  }
 
   // Continues at `time`: writes the newest record before it at once, so that readers have one.
   bool seek(double time, bool reverse) {
-    has_next_ = log_.readTime(time);
     reverse_ = reverse;
-    if (has_next_ && log_.time() < time) return write();
-    return true;  // all are later
+    has_next_ = skip_unusable(log_.readTime(time), true);
+    // Before a record that is left out may be some of later times.
+    while (has_next_ && log_.time() >= time) take(true);
+    if (has_next_) return write();
+    has_next_ = skip_unusable(log_.readTime(-kInfinity), false);  // all are later
+    return true;
   }
 
   // The time of the last record.
-  double end_time() { return log_.readTime(kInfinity) ? log_.time() : log_.getStartTime(); }
+  double end_time() {
+    return skip_unusable(log_.readTime(kInfinity), true) ? log_.time() : log_.getStartTime();
+  }
 
  private:
-  void take(bool reverse) { has_next_ = reverse ? log_.readBack() : log_.readNext(); }
+  bool read(bool reverse) { return reverse ? log_.readBack() : log_.readNext(); }
+  void take(bool reverse) { has_next_ = skip_unusable(read(reverse), reverse); }
+
+  // From the record in the buffer, if there is one, to the first whose time a sample can have;
+  // false when there is none.
+  bool skip_unusable(bool has_record, bool reverse) {
+    while (has_record && !dssm::is_sample_time(log_.time())) {
+      if (!warned_) {
+        std::fprintf(stderr,
+                     "WARNING : records of '%s' are left out : their times are not between the "
+                     "years 1678 and 2261\n",
+                     file_name_);
+      }
+      warned_ = true;
+      has_record = read(reverse);
+    }
+    return has_record;
+  }
 
   // After a change of direction the buffered record is on the wrong side of the clock.
   void turn(bool reverse) {
@@ -167,10 +191,12 @@ class Track {
     take(reverse);
   }
 
+  const char* file_name_ = "";
   SSMLogBase log_;
   SSMApiBase stream_;
   std::vector<char> data_, property_;
   bool has_next_ = false;
+  bool warned_ = false;  // of records that are left out
   bool reverse_ = false;
 };
 

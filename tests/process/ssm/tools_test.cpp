@@ -16,6 +16,7 @@
 #include <filesystem>
 #include <fstream>
 #include <iterator>
+#include <limits>
 #include <tuple>
 
 #include "tests/process/ssm/run_program.hpp"
@@ -329,6 +330,25 @@ TEST_F(SsmPlayer, PlaysSeveralLogsInTheOrderOfTimeAndSkipsWhatIsNone) {
   EXPECT_EQ(run_tool("ssm-player", {none}).exit_status, 1);
   EXPECT_EQ(run_tool("ssm-player", {}).exit_status, 1);
   EXPECT_EQ(run_tool("ssm-player", {"-x", "fast", log}).exit_status, 1);
+}
+
+// The clock never came to a record of an infinite time.
+TEST_F(SsmPlayer, LeavesRecordsOutWhoseTimeNoSampleCanHave) {
+  constexpr double kInfinity = std::numeric_limits<double>::infinity();
+  save_log({kInfinity, 1001, std::nan(""), 1002, -kInfinity, 1003, -1e300, 1e300});
+  const Finished played = run_tool("ssm-player", {"-q", "-x", "1000", log});
+  EXPECT_EQ(played.exit_status, 0);
+  EXPECT_EQ(played.err, "WARNING : records of '" + log +
+                            "' are left out : their times are not between the years 1678 and "
+                            "2261\n");
+  EXPECT_EQ(played_times(), (std::vector<double>{1001, 1002, 1003}));
+  ASSERT_TRUE(session.remove(kOdometry));
+  EXPECT_EQ(play({"-S", "1002.5", "-x", "1000"}), (std::vector<double>{1002, 1003}));
+  ASSERT_TRUE(session.remove(kOdometry));
+  EXPECT_EQ(play({"-S", "1000", "-x", "1000"}), (std::vector<double>{1001, 1002, 1003}));
+  ASSERT_TRUE(session.remove(kOdometry));
+  EXPECT_EQ(play({"-S", "1003.5", "-x", "-1000"}), (std::vector<double>{1003, 1002, 1001}));
+  EXPECT_TRUE(clock_is_reset());
 }
 
 TEST_F(SsmPlayer, ObeysCommandsAndNeverLeavesTheClockPaused) {
