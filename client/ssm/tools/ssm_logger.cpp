@@ -78,8 +78,13 @@ bool parse(int argc, char** argv, Options& options) {
     }
   }
   if (optind < argc) return print_error("'%s' is not an option; see --help", argv[optind]), false;
-  if (options.log_name && options.stream_name) return true;
-  print_error("give the log's name and the stream's: ssm-logger -l FILE -n NAME");
+  if (!options.log_name || !options.stream_name) {
+    print_error("give the log's name and the stream's: ssm-logger -l FILE -n NAME");
+    return false;
+  }
+  if (!std::strchr(options.stream_name, ':')) return true;
+  print_error("'%s' is not a stream's name, which has no ':' : give the number with -i",
+              options.stream_name);
   return false;
 }
 
@@ -94,8 +99,12 @@ class Recorder {
     stream_.setVerbose(false);
     if (dssm_ssm_wait_stream(options_.stream_name, options_.stream_id, kMaxWaitSeconds) != 1) {
       if (!end_requested) {
-        print_error("cannot get ssm info of '%s' [%d] : there is no such stream; lsssm lists them",
-                    options_.stream_name, options_.stream_id);
+        // lsssm lists this PC's alone.
+        const bool has_host = std::strchr(options_.stream_name, '@') != nullptr;
+        print_error(
+            "cannot get ssm info of '%s' [%d] : there is no such stream; %s lists them, and "
+            "-i gives the number",
+            options_.stream_name, options_.stream_id, has_host ? "dssmctl ls" : "lsssm");
       }
       return false;
     }

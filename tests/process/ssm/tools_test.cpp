@@ -301,6 +301,22 @@ TEST_F(SsmLogger, ExitsWith255WhenItCannotRecord) {
   }
 }
 
+// As dssmctl writes streams.
+TEST_F(SsmLogger, SaysHowTheNumberOfAStreamIsGiven) {
+  for (const char* name : {"spur_odometry:3", "spur_odometry:3@pc1"}) {
+    const Finished finished = run_tool("ssm-logger", {"-q", "-l", log, "-n", name});
+    EXPECT_EQ(finished.exit_status, 255);
+    EXPECT_EQ(finished.err, "ERROR : '" + std::string(name) +
+                                "' is not a stream's name, which has no ':' : give the number with "
+                                "-i\n");
+  }
+  // Not a name of a host, so it waits for none.
+  const Finished finished = run_tool("ssm-logger", {"-q", "-l", log, "-n", "spur_odometry@"});
+  EXPECT_EQ(finished.exit_status, 255);
+  EXPECT_NE(finished.err.find("dssmctl ls lists them, and -i gives the number"), std::string::npos)
+      << finished.err;
+}
+
 // --- the player
 
 struct SsmPlayer : SsmTools {};
