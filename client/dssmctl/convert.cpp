@@ -195,13 +195,7 @@ class Converter {
     if (out.extension() == ".mcap") return to_mcap();
     if (out.extension() == ".log") {
       if (wanted_.size() == 1) return to_logs({out});
-      std::vector<std::string> names;
-      for (const std::size_t i : wanted_) names.push_back(escaped(info(i).id.str()));
-      return Error{
-          Errc::invalid_argument,
-          fmt::format("a log holds one stream, and there are {}; choose one with --stream, "
-                      "or give a folder",
-                      list_text(names))};
+      return Error{Errc::invalid_argument, too_many_for_a_log()};
     }
     std::error_code error;
     fs::create_directories(out, error);
@@ -211,6 +205,24 @@ class Converter {
 
  private:
   const RecordedStreamInfo& info(std::size_t stream) const { return recording_.streams()[stream]; }
+
+  // Why the wanted streams are not one log, and what to do.
+  std::string too_many_for_a_log() const {
+    std::vector<std::string> names;
+    for (const std::size_t i : wanted_) {
+      std::string name = escaped(info(i).id.str());
+      if (std::ranges::find(names, name) == names.end()) names.push_back(std::move(name));
+    }
+    if (names.size() > 1) {
+      return fmt::format(
+          "a log holds one stream, and there are {}; choose one with --stream, or give a folder",
+          list_text(names));
+    }
+    return fmt::format(
+        "'{}' was created again during the recording, and a log holds one creation of a stream; "
+        "give a folder, in which each of the {} gets a log",
+        names.front(), wanted_.size());
+  }
 
   Result<Converted> to_mcap() {
     RecordingOptions how;
@@ -239,7 +251,7 @@ class Converter {
       };
       std::string name = fmt::format("{}-{}", id.name, id.id);
       std::ranges::replace(name, '/', '_');
-      if (std::ranges::any_of(wanted_, is_other_host)) name += "@" + id.host;
+      if (!id.host.empty() && std::ranges::any_of(wanted_, is_other_host)) name += "@" + id.host;
       fs::path path = folder / (name + ".log");
       for (int n = 1; std::ranges::find(paths, path) != paths.end(); ++n) {
         path = folder / fmt::format("{}_{}.log", name, n);

@@ -107,6 +107,38 @@ TEST_F(Convert, OfARecordingGivesLogsThatSsmReads) {
             "pose 0 8 16 0.020000 1795250129.500000 2\nab" + record);
 }
 
+// No --stream chooses one of these.
+TEST_F(Convert, OfAStreamThatWasCreatedAgainTakesAFolder) {
+  RecordingWriter writer = RecordingWriter::create(file("a.mcap")).value();
+  RecordedStream stream;
+  stream.id = {"pose", 0, "pc1"};
+  stream.type.payload_bytes = 8;
+  for (stream.incarnation = 1; stream.incarnation <= 2; ++stream.incarnation) {
+    ASSERT_TRUE(writer.add_stream(stream));
+  }
+  ASSERT_TRUE(writer.finish());
+  const std::string why = refusal({"convert", file("a.mcap"), file("a.log"), "--stream", "pose"});
+  EXPECT_TRUE(contains(why, "'pose:0@pc1' was created again during the recording")) << why;
+  EXPECT_TRUE(contains(why, "give a folder, in which each of the 2 gets a log")) << why;
+  EXPECT_FALSE(contains(why, "choose")) << why;
+  EXPECT_EQ(json({"convert", file("a.mcap"), file("logs")})["files"],
+            (Json{file("logs/pose-0.log"), file("logs/pose-0_1.log")}));
+}
+
+// That of a log has none.
+TEST_F(Convert, OfAStreamWithoutAHostBesideOneWithAHostNamesItsLogWithoutOne) {
+  RecordingWriter writer = RecordingWriter::create(file("a.mcap")).value();
+  RecordedStream stream;
+  stream.id = {"pose", 0, ""};
+  stream.type.payload_bytes = 8;
+  ASSERT_TRUE(writer.add_stream(stream));
+  stream.id.host = "pc1";
+  ASSERT_TRUE(writer.add_stream(stream));
+  ASSERT_TRUE(writer.finish());
+  EXPECT_EQ(json({"convert", file("a.mcap"), file("logs")})["files"],
+            (Json{file("logs/pose-0.log"), file("logs/pose-0@pc1.log")}));
+}
+
 // A ring has at least one byte per sample, so a recording says one where a log says none.
 TEST_F(Convert, OfARecordingOfAStreamOfSizeZeroGivesItsLog) {
   RecordingWriter writer = RecordingWriter::create(file("a.mcap")).value();
