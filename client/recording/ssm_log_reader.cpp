@@ -39,9 +39,8 @@ Result<void> FileReader::begin_log(std::string_view begin) {
   const SsmLogHead& head = *log_;
   FileChannel& channel = channels_[kChannel];
   channel.stream = stream_of_log(head, begin);
-  for (Result<void> checked : {channel.stream->id.check(), channel.stream->type.check()}) {
-    if (!checked) return std::move(checked).error().context("it is a log of SSM");
-  }
+  DSSM_TRY(channel.stream->id.check());
+  DSSM_TRY(channel.stream->type.check());
   channel.channel.topic = topic_of(channel.stream->id);
   const auto property = DSSM_TRY(read(head.line_bytes, head.property_bytes));
   channel.stream->property.assign(property.begin(), property.end());

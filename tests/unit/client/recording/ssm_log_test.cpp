@@ -171,7 +171,7 @@ TEST_F(SsmLogs, ThatAreNoneAreRefusedWithTheReason) {
   EXPECT_THAT(error_of("a 0 99999999999 10 0.1 1000 0\n"), HasSubstr("sizes beyond 2147483647"));
   EXPECT_THAT(error_of("a 0 2147483647 10 0.1 1000 0\n"), HasSubstr("64 MiB"));
   EXPECT_THAT(error_of("a 0 8 10 0.1 1000 5\nprop"), HasSubstr("ends inside its property"));
-  EXPECT_THAT(error_of("a:b 0 8 10 0.1 1000 0\n"), HasSubstr("'a:b'"));
+  EXPECT_THAT(error_of("a:b 0 8 10 0.1 1000 0\n"), HasSubstr("as a log of SSM: stream name 'a:b'"));
   EXPECT_EQ(repair_recording(save("a.log", "a 0 8 10 0.1 1000 0\n")).error().code,
             Errc::invalid_argument);
 }
