@@ -139,7 +139,7 @@ class StreamLog {
       : json_(options.json), filter_(filter), out_(out) {}
 
   void on_event(const StreamEvent& event) {
-    if (!filter_.takes(event.stream.id) || event.property_set) return;
+    if (!filter_.takes(event.stream.id) || event.property_set || event.described) return;
     const std::string name = event.stream.id.str();
     if (event.kind == StreamEvent::Kind::removed) {
       shown_.erase(name);

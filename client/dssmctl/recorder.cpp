@@ -85,18 +85,15 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
     const auto known = known_.find(name);
     if (event.property_set) {
       want_property({event.stream, event.property_after, MonoClock::now()});
+    } else if (event.described) {
+      described_.insert_or_assign(name, event.stream.type);
     } else if (known != known_.end() && event.stream.property_bytes > 0) {
       // It was created again, or its host is there again. Its reader continues.
       const bool is_new = known->second != event.stream.incarnation;
       want_property(
           {event.stream, is_new ? std::optional(kNoTid) : std::nullopt, MonoClock::now()});
     }
-    if (known != known_.end()) {
-      known->second = event.stream.incarnation;
-      if (!event.stream.type.fields.empty()) {
-        described_.insert_or_assign(event.stream.id.str(), event.stream.type);
-      }
-    }
+    if (known != known_.end()) known->second = event.stream.incarnation;
   }
   const auto is_it = [&](const Wanted& wanted) { return wanted.stream.id == event.stream.id; };
   std::erase_if(removed_, [&](const auto& entry) { return entry.first == event.stream.id; });

@@ -175,7 +175,7 @@ class Recorder {
     std::vector<Source> take_opened();
     // To be called before take_opened(), which then has their streams.
     std::vector<std::pair<StreamId, NewProperty>> take_properties();
-    // Types of streams that are open, by their names: described, maybe, since they were opened.
+    // Types of streams, by their names, that were described since the last call.
     std::map<std::string, TypeInfo> take_described();
     std::vector<std::string> take_notices();
     bool has_tried_all() const;  // of the streams that there were at begin()
@@ -220,7 +220,7 @@ class Recorder {
     std::vector<Source> opened_;
     std::vector<SetProperty> set_properties_;                   // the last change of each stream
     std::vector<std::pair<StreamId, NewProperty>> properties_;  // fetched
-    std::map<std::string, TypeInfo> described_;                 // by name, since they were opened
+    std::map<std::string, TypeInfo> described_;                 // by name
     std::vector<std::string> notices_;
     std::optional<MonoTime> stop_at_;
 

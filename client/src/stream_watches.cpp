@@ -21,7 +21,7 @@ Result<std::uint64_t> StreamWatches::add(OnEvent on_event) {
     const std::lock_guard guard(mutex_);
     key = next_key_++;
     for (const auto& [name, stream] : known_) {
-      on_event(StreamEvent{StreamEvent::Kind::added, stream, false});
+      on_event(StreamEvent{StreamEvent::Kind::added, stream, false, {}, false});
     }
     watches_[key] = std::move(on_event);
     is_first = !std::exchange(watching_, true);
@@ -71,7 +71,8 @@ void StreamWatches::on_event(const proto::StreamEvent& message) {
   StreamEvent event{message.removed() ? StreamEvent::Kind::removed : StreamEvent::Kind::added,
                     wire::stream_info(message.stream()),
                     false,
-                    {}};
+                    {},
+                    false};
   const std::string name = event.stream.id.str();
   const std::lock_guard guard(mutex_);
   unconfirmed_.erase(name);
@@ -83,7 +84,8 @@ void StreamWatches::on_event(const proto::StreamEvent& message) {
     if (!is_new && known.incarnation == event.stream.incarnation) {
       event.property_set =
           message.property_set() || known.property_bytes != event.stream.property_bytes;
-      if (!event.property_set) return;  // it has a description now
+      event.described = known.type.is_less_described_than(event.stream.type);
+      if (!event.property_set && !event.described) return;
       if (message.property_set()) event.property_after = event.stream.newest;
     }
   }

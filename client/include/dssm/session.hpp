@@ -177,6 +177,8 @@ struct StreamEvent {
   // For property_set: samples after this one are written with the new property; kNoTid: all are.
   // Empty: that is not known, after a reconnect.
   std::optional<Tid> property_after;
+  // Added: the stream was known before, and its type has a name or fields now that it had not.
+  bool described = false;
 };
 
 // How a stream is created.
@@ -328,8 +330,8 @@ class Session {
 
   // Calls `on_event` for each existing stream, then for each one added or removed, until the watch
   // is destroyed. A stream that is recreated is reported as added again, and so is one whose
-  // property was set (StreamEvent::property_set). The calls come from the session's thread, and
-  // from watch() itself: `on_event` must return soon and must not call the session. After a
+  // property was set or that was described (StreamEvent::property_set, StreamEvent::described). The
+  // calls come from the session's thread, and from watch() itself: `on_event` must return soon and must not call the session. After a
   // reconnect only differences are reported; a property differs if its length does.
   class Watch {
    public:

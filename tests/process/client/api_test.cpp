@@ -488,6 +488,29 @@ TEST_F(Api, NotifiesWatchersOfPropertiesWithTheNewestSample) {
   }
 }
 
+TEST_F(Api, NotifiesWatchersOfDescriptions) {
+  const TypeInfo type = type_of<Odometry>();
+  const TypeInfo bytes{"", type.payload_bytes, type.alignment_bytes, {}};
+  const RawWriter writer = session.create_raw({"s", 0, ""}, bytes, History{4, 10ms}).value();
+  std::mutex mutex;
+  std::condition_variable changed;
+  std::vector<StreamEvent> seen;
+  auto watch = session.watch([&](const StreamEvent& event) {
+    const std::lock_guard guard(mutex);
+    seen.push_back(event);
+    changed.notify_all();
+  });
+  ASSERT_TRUE(watch);
+  ASSERT_TRUE(session.describe(writer.id(), type));
+  std::unique_lock lock(mutex);
+  changed.wait(lock, [&] { return seen.size() >= 2; });
+  EXPECT_FALSE(seen[0].described);
+  EXPECT_TRUE(seen[1].described);
+  EXPECT_FALSE(seen[1].property_set);
+  EXPECT_EQ(seen[1].stream.type, type);
+  EXPECT_EQ(seen[1].stream.incarnation, writer.incarnation());
+}
+
 TEST_F(Api, AwaitsAStreamThatComesLater) {
   EXPECT_EQ(session.await_reader<Odometry>("late", deadline_in(10ms)).error().code,
             Errc::not_found);
