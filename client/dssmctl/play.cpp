@@ -17,6 +17,7 @@
 #include <string_view>
 #include <utility>
 
+#include "client/dssmctl/black_box_streams.hpp"
 #include "client/dssmctl/keyboard.hpp"
 #include "client/dssmctl/lockstep.hpp"
 #include "client/dssmctl/names.hpp"
@@ -140,7 +141,6 @@ class Player {
   Result<void> prepare() {
     const DaemonInfo daemon = DSSM_TRY(session_.daemon_info());
     own_host_ = daemon.host;
-    const StreamFilter filter({}, options_.patterns);
     struct Source {
       std::string name;
       std::size_t stream;
@@ -152,7 +152,7 @@ class Player {
       const RecordedStreamInfo& stream = streams[i];
       writers_.emplace_back();
       targets_.push_back(i);
-      if (!filter.takes(stream.id)) continue;
+      if (!is_wanted(stream.id)) continue;
       const StreamId id = DSSM_TRY(target_of(stream.id));
       const auto [entry, is_new] = sources.emplace(id.str(), Source{stream.id.str(), i});
       if (!is_new && entry->second.name != stream.id.str()) {
@@ -273,6 +273,20 @@ class Player {
 
     friend bool operator==(const Property&, const Property&) = default;
   };
+
+  // Requests to the black box that are in the recording would be requests to the one here.
+  bool is_wanted(const StreamId& id) const {
+    if (!StreamFilter({}, options_.patterns).takes(id)) return false;
+    if (!is_of_black_box(id)) return true;
+    const auto names_it = [&](const std::string& pattern) {
+      return pattern.starts_with("dssm_") && StreamFilter({}, {pattern}).takes(id);
+    };
+    const auto maps_it = [&](const std::string& mapping) {
+      return StreamFilter({}, {mapping.substr(0, mapping.find('='))}).takes(id);
+    };
+    return std::ranges::any_of(options_.patterns, names_it) ||
+           std::ranges::any_of(options_.mappings, maps_it);
+  }
 
   // Its name here, with a host.
   Result<StreamId> target_of(const StreamId& id) const {

@@ -510,6 +510,23 @@ class Play : public Record {
     ASSERT_TRUE(writer.finish());
   }
 
+  // A sample of a stream of doubles, which is added if it is not there.
+  static void write_number(RecordingWriter& writer, const StreamId& id, std::int64_t number,
+                           std::uint64_t incarnation = 1) {
+    const auto stream =
+        writer.add_stream({id, type_of<double>(), 64, 1ms, incarnation, {}}).value();
+    const double value = static_cast<double>(number);
+    const SampleInfo info{number, at_ns(kSecond + number * 1'000'000), 1us, sizeof value};
+    ASSERT_TRUE(writer.write(stream, info, 1us, std::as_bytes(std::span(&value, 1))));
+  }
+  std::vector<std::string> own_streams() {
+    std::vector<std::string> names;
+    for (const StreamInfo& stream : session_.list_own_streams().value()) {
+      names.push_back(stream.id.name);
+    }
+    return names;
+  }
+
   int property() {  // -1: none
     const auto property = session_.property({"pose", 0, ""});
     return property ? std::to_integer<int>(property->at(0)) : -1;
@@ -678,6 +695,23 @@ TEST_F(Play, DoesNotWriteBesideAnotherProgram) {
   EXPECT_EQ(pose.newest_tid(), kNoTid);
   output({"play", file_, "--force"});
   expect_played("pose", 0, 99);
+}
+
+// A request that is played would be one for the black box of this PC.
+TEST_F(Play, LeavesOutTheStreamsOfTheBlackBox) {
+  auto writer = RecordingWriter::create(file_).value();
+  for (const char* name : {"dssm_trigger", "number", "dssm_incident"}) {
+    write_number(writer, {name, 0, "pc9"}, 0);
+  }
+  ASSERT_TRUE(writer.finish());
+  using Names = std::vector<std::string>;
+  output({"play", file_});
+  output({"play", file_, "*"});
+  EXPECT_EQ(own_streams(), Names{"number"});
+  output({"play", file_, "--map", "dssm_incident=old"});
+  EXPECT_EQ(own_streams(), Names({"number", "old"}));
+  output({"play", file_, "dssm_t*"});
+  EXPECT_EQ(own_streams(), Names({"number", "old", "dssm_trigger"}));
 }
 
 TEST_F(Play, PlaysBackwards) {
