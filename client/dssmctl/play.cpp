@@ -13,7 +13,6 @@
 #include <functional>
 #include <map>
 #include <optional>
-#include <set>
 #include <string_view>
 #include <utility>
 
@@ -135,49 +134,69 @@ class Player {
         range_(range),
         out_(out),
         course_(recording, range,
-                [this](std::size_t stream) { return writers_[stream].has_value(); }) {}
+                [this](std::size_t stream) { return target_of_[stream].has_value(); }) {}
 
-  // Creates the streams.
+  // Creates the streams, once all of them have been checked.
   Result<void> prepare() {
     const DaemonInfo daemon = DSSM_TRY(session_.daemon_info());
     own_host_ = daemon.host;
-    struct Source {
-      std::string name;
-      std::size_t stream;
-    };
-    std::map<std::string, Source> sources;  // by the name here
+    std::map<std::string, std::size_t> by_name;  // index in targets_
     const std::vector<RecordedStreamInfo>& streams = recording_.streams();
-    properties_.resize(streams.size());
+    target_of_.resize(streams.size());
     for (std::size_t i = 0; i < streams.size(); ++i) {
       const RecordedStreamInfo& stream = streams[i];
-      writers_.emplace_back();
-      targets_.push_back(i);
       if (!is_wanted(stream.id)) continue;
-      const StreamId id = DSSM_TRY(target_of(stream.id));
-      const auto [entry, is_new] = sources.emplace(id.str(), Source{stream.id.str(), i});
-      if (!is_new && entry->second.name != stream.id.str()) {
+      StreamId id = DSSM_TRY(target_of(stream.id));
+      const auto [entry, is_new] = by_name.emplace(id.str(), targets_.size());
+      if (is_new) targets_.push_back({.id = std::move(id), .source = stream.id});
+      const Target& target = targets_[entry->second];
+      if (target.source != stream.id) {
         return Error{Errc::invalid_argument,
                      fmt::format("'{}' and '{}' are both to be played as '{}'; --map {}=OTHER "
                                  "renames one",
-                                 escaped(entry->second.name), escaped(stream.id.str()),
-                                 escaped(short_name(id)), escaped(stream.id.str()))};
+                                 escaped(target.source.str()), escaped(stream.id.str()),
+                                 escaped(short_name(target.id)), escaped(stream.id.str()))};
       }
-      writers_.back() = DSSM_TRY(writer_for(id, stream, is_new));
-      targets_.back() = entry->second.stream;
+      target_of_[i] = entry->second;
       if (!stream.property_times.empty() && stream.property_times.back() != Time::min()) {
         changing_.push_back(i);
       }
-      is_any_ = true;
     }
-    if (!is_any_) return Error{Errc::not_found, "no stream of the recording fits"};
+    if (targets_.empty()) return Error{Errc::not_found, "no stream of the recording fits"};
+    for (const Target& target : targets_) DSSM_TRY(check_writers(target.id));
+    if (!options_.lockstep.empty()) {
+      // All is the same each time, also what the rings hold at first.
+      for (const Target& target : targets_) {
+        if (session_.stream_info(target.id)) DSSM_TRY(session_.remove(target.id));
+      }
+    }
+    for (std::size_t i = 0; i < streams.size(); ++i) {
+      if (target_of_[i]) DSSM_TRY(open(i));
+    }
     return set_properties(options_.rate < 0 ? range_.to : range_.from);
+  }
+
+  // After a failure: of the streams that prepare() created none is left that nothing was written
+  // to. A program that creates one with another type would be refused.
+  void remove_empty_streams() {
+    for (Target& target : targets_) {
+      if (!target.is_created || target.has_samples) continue;
+      const Result<StreamInfo> info = session_.stream_info(target.id);
+      const std::uint32_t own_writers = target.writer ? 1 : 0;
+      if (!info || info->newest != kNoTid || info->writers > own_writers) continue;
+      target.writer.reset();
+      if (const Result<void> removed = session_.remove(target.id); !removed) {
+        print_notice(
+            fmt::format("an empty stream is left: {}", escaped_message(removed.error().message)));
+      }
+    }
   }
 
   // Says which other streams of this PC programs may find with samples of before.
   Result<void> check_leftovers() {
     for (const StreamInfo& stream : DSSM_TRY(session_.list_own_streams())) {
-      const bool is_played = std::any_of(writers_.begin(), writers_.end(), [&](const auto& writer) {
-        return writer && writer->id().name == stream.id.name && writer->id().id == stream.id.id;
+      const bool is_played = std::ranges::any_of(targets_, [&](const Target& target) {
+        return target.id.name == stream.id.name && target.id.id == stream.id.id;
       });
       if (is_played || stream.writers > 0 || stream.newest == kNoTid) continue;
       const std::string name = escaped(short_name(stream.id));
@@ -250,15 +269,13 @@ class Player {
 
   void print_summary() {
     out_.clear_line();
-    const std::size_t streams = static_cast<std::size_t>(std::count_if(
-        writers_.begin(), writers_.end(), [](const auto& writer) { return writer.has_value(); }));
     if (options_.json) {
-      out_.add(
-          json_document({{"file", options_.file}, {"streams", streams}, {"samples", played_}}));
+      out_.add(json_document(
+          {{"file", options_.file}, {"streams", targets_.size()}, {"samples", played_}}));
     } else {
       out_.add(fmt::format("{}: {} of {} played\n", escaped(options_.file),
                            counted(played_, "sample", "samples"),
-                           counted(streams, "stream", "streams")));
+                           counted(targets_.size(), "stream", "streams")));
     }
   }
 
@@ -273,6 +290,18 @@ class Player {
 
     friend bool operator==(const Property&, const Property&) = default;
   };
+
+  // A stream here, which has the samples of one of the recording, of all its incarnations.
+  struct Target {
+    StreamId id;      // with a host
+    StreamId source;  // its name in the recording
+    std::optional<RawWriter> writer = {};
+    bool is_created = false;   // by this program
+    bool has_samples = false;  // of this program
+    Property property = {};
+  };
+
+  Target& target(std::size_t stream) { return targets_[*target_of_[stream]]; }
 
   // Requests to the black box that are in the recording would be requests to the one here.
   bool is_wanted(const StreamId& id) const {
@@ -302,21 +331,25 @@ class Player {
     return target;
   }
 
-  Result<RawWriter> writer_for(const StreamId& id, const RecordedStreamInfo& stream,
-                               bool is_first) {
+  Result<void> check_writers(const StreamId& id) {
     const Result<StreamInfo> existing = session_.stream_info(id);
-    if (is_first && existing && existing->writers > 0 && !options_.force) {
-      return Error{Errc::conflict,
-                   fmt::format("'{}' is written by another program; end that, give --map {}=OTHER, "
-                               "or --force to write beside it",
-                               escaped(existing->id.str()), escaped(short_name(id)))};
-    }
-    // In lockstep all is the same each time, also what the ring holds at first.
-    if (is_first && existing && !options_.lockstep.empty()) {
-      DSSM_TRY(session_.remove(existing->id));
-    }
+    if (!existing || existing->writers == 0 || options_.force) return {};
+    return Error{Errc::conflict,
+                 fmt::format("'{}' is written by another program; end that, give --map {}=OTHER, "
+                             "or --force to write beside it",
+                             escaped(existing->id.str()), escaped(short_name(id)))};
+  }
+
+  // Has the target of that stream of the recording take its samples.
+  Result<void> open(std::size_t from) {
+    Target& target = this->target(from);
+    const RecordedStreamInfo& stream = recording_.streams()[from];
     const History history{std::max(stream.depth, kMinDepth), stream.cycle};
-    return session_.create_raw(id, stream.type, history, {.keep_existing = true});
+    const bool is_there = session_.stream_info(target.id).has_value();
+    target.writer =
+        DSSM_TRY(session_.create_raw(target.id, stream.type, history, {.keep_existing = true}));
+    target.is_created |= !is_there;
+    return {};
   }
 
   // --- properties
@@ -324,13 +357,14 @@ class Player {
   // Has the stream that is played from stream `from` of the recording get the property that it had
   // at `t`. One that it has from elsewhere stays until the recording has one.
   Result<void> set_property(std::size_t from, Time t) {
-    Property& set = properties_[targets_[from]];
+    Target& target = this->target(from);
+    Property& set = target.property;
     const Property wanted{from, recording_.streams()[from].property_at(t)};
     const bool is_new = wanted.index && wanted != set;
     if (is_new || (!wanted.index && set.index)) {
       std::vector<std::byte> property;
       if (is_new) property = DSSM_TRY(recording_.property(from, *wanted.index));
-      const StreamId& id = writers_[from]->id();
+      const StreamId& id = target.writer->id();
       const Result<void> done = session_.set_property(id, property);
       // Its samples are played all the same: another host may be lost for a while.
       if (!done) {
@@ -343,17 +377,24 @@ class Player {
     return {};
   }
 
-  // All streams get what they had at `t`; one that restarted, in the incarnation that it had then.
+  // All streams get what they had at `t`.
   Result<void> set_properties(Time t) {
-    std::map<std::size_t, std::size_t> streams;  // by target
-    for (std::size_t i = 0; i < writers_.size(); ++i) {
-      if (!writers_[i]) continue;
-      const RecordedStreamInfo& stream = recording_.streams()[i];
-      if (stream.samples > 0 && stream.first_time <= t) streams[targets_[i]] = i;
-      streams.try_emplace(targets_[i], i);
-    }
-    for (const auto& [target, i] : streams) DSSM_TRY(set_property(i, t));
+    for (const std::size_t i : incarnations_at(t)) DSSM_TRY(set_property(i, t));
     return {};
+  }
+
+  // For each target the stream of the recording from which it has its samples at `t`.
+  std::vector<std::size_t> incarnations_at(Time t) const {
+    std::map<std::size_t, std::size_t> streams;  // by target
+    for (std::size_t i = 0; i < target_of_.size(); ++i) {
+      if (!target_of_[i]) continue;
+      const RecordedStreamInfo& stream = recording_.streams()[i];
+      if (stream.samples > 0 && stream.first_time <= t) streams[*target_of_[i]] = i;
+      streams.try_emplace(*target_of_[i], i);
+    }
+    std::vector<std::size_t> all;
+    for (const auto& [target, stream] : streams) all.push_back(stream);
+    return all;
   }
 
   // At the end of what is played: also those that were set after the last sample.
@@ -367,7 +408,7 @@ class Player {
   Result<void> set_late_properties(Time now) {
     const Time due = saturating_add(now, -kPropertyWait);
     for (const std::size_t i : changing_) {
-      const Property& set = properties_[targets_[i]];
+      const Property& set = target(i).property;
       if (set.stream != i || recording_.streams()[i].property_at(due) <= set.index) continue;
       DSSM_TRY(set_property(i, due));
     }
@@ -381,7 +422,8 @@ class Player {
   }
 
   Result<void> write(const RecordedSample& sample, Time stamp) {
-    RawWriter& writer = *writers_[sample.stream];
+    Target& target = this->target(sample.stream);
+    RawWriter& writer = *target.writer;
     const Tid tid = options_.now ? writer.write(sample.payload, stamp)
                                  : writer.write(sample.payload, stamp, sample.info.clock_error);
     if (tid == kNoTid) {
@@ -390,6 +432,7 @@ class Player {
                                "stopped that writes it? `dssmctl info` names them",
                                escaped(writer.id().str()))};
     }
+    target.has_samples = true;
     ++played_;
     return {};
   }
@@ -410,10 +453,8 @@ class Player {
     course_.seek(saturating_add(time, Duration(1)));
     last_stepped_.reset();
     DSSM_TRY(set_properties(time));
-    std::set<std::string> done;  // a stream that restarted is several
     std::vector<std::byte> payload;
-    for (std::size_t i = 0; i < writers_.size(); ++i) {
-      if (!writers_[i] || !done.insert(recording_.streams()[i].id.str()).second) continue;
+    for (const std::size_t i : incarnations_at(time)) {
       Result<RecordedRawReader> reader = recording_.open_raw_reader(recording_.streams()[i].id);
       if (!reader) continue;  // its type has changed on the way
       payload.resize(reader->payload_bytes());
@@ -514,14 +555,12 @@ class Player {
   Output& out_;
   Keyboard keyboard_;
   std::string own_host_;
-  std::vector<std::optional<RawWriter>> writers_;  // of each stream of the recording
-  std::vector<std::size_t> targets_;   // the same: of those with one name here, the first one
-  std::vector<Property> properties_;   // by target: what it has
-  std::vector<std::size_t> changing_;  // streams whose property changes
+  std::vector<Target> targets_;
+  std::vector<std::optional<std::size_t>> target_of_;  // of each stream of the recording
+  std::vector<std::size_t> changing_;                  // streams whose property changes
   Course course_;
   std::optional<std::pair<bool, Time>> last_stepped_;  // backwards, and to which time
-  bool is_any_ = false;
-  bool shows_now_ = false;  // what a key has changed
+  bool shows_now_ = false;                             // what a key has changed
   std::uint64_t played_ = 0;
 };
 
@@ -542,23 +581,28 @@ Result<void> run(const PlayOptions& options, Output& out) {
   if (!options.now) clock = DSSM_TRY(session.open_playback_clock());
   const Session sharing = session;
   Player player(options, std::move(session), recording, range, out);
-  DSSM_TRY(player.prepare());
-  catch_stop_signals();
-  Result<void> played;
-  if (options.lockstep.empty()) {
-    std::optional<SharedPlayback> others;
-    if (clock && !options.this_host) others.emplace(sharing, *clock, print_notice);
-    Timeline timeline(std::move(clock), others ? SharedPlayback::kLead : Duration::zero());
-    played = player.play_by(timeline);
-  } else {
-    DSSM_TRY(player.check_leftovers());
-    const auto lockstep =
-        DSSM_TRY(Lockstep::start(options.lockstep, options.socket_path, range.from, out));
-    played = player.play_by(*lockstep, *clock);
-    clock->reset();
-  }
-  player.print_summary();
-  tell_warnings();
+  const auto play = [&]() -> Result<void> {
+    DSSM_TRY(player.prepare());
+    catch_stop_signals();
+    Result<void> played;
+    if (options.lockstep.empty()) {
+      std::optional<SharedPlayback> others;
+      if (clock && !options.this_host) others.emplace(sharing, *clock, print_notice);
+      Timeline timeline(std::move(clock), others ? SharedPlayback::kLead : Duration::zero());
+      played = player.play_by(timeline);
+    } else {
+      DSSM_TRY(player.check_leftovers());
+      const auto lockstep =
+          DSSM_TRY(Lockstep::start(options.lockstep, options.socket_path, range.from, out));
+      played = player.play_by(*lockstep, *clock);
+      clock->reset();
+    }
+    player.print_summary();
+    tell_warnings();
+    return played;
+  };
+  const Result<void> played = play();
+  if (!played) player.remove_empty_streams();
   return played;
 }
 

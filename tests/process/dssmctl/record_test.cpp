@@ -714,6 +714,22 @@ TEST_F(Play, LeavesOutTheStreamsOfTheBlackBox) {
   EXPECT_EQ(own_streams(), Names({"number", "old", "dssm_trigger"}));
 }
 
+// Else a program that creates one of them with another type would be refused.
+TEST_F(Play, LeavesNoEmptyStreamsWhenItFails) {
+  auto writer = RecordingWriter::create(file_).value();
+  for (const std::int64_t i : {0, 1, 2}) write_number(writer, {"number", 0, "pc9"}, i);
+  write_number(writer, {"other", 0, "pc9"}, 3);
+  ASSERT_TRUE(writer.finish());
+  const Finished nothing = ctl({"play", file_, "number", "--from", "1.003"});
+  EXPECT_TRUE(contains(nothing.err, "no sample of these streams is in that part")) << nothing.err;
+  EXPECT_EQ(own_streams(), std::vector<std::string>{});
+  { const auto other = session_.create<RecordedPose>("other", depth_of(64)).value(); }
+  const Finished refused = ctl({"play", file_});
+  EXPECT_EQ(refused.exit_status, 1);
+  EXPECT_TRUE(contains(refused.err, "'other")) << refused.err;
+  EXPECT_EQ(own_streams(), std::vector<std::string>{"other"});
+}
+
 TEST_F(Play, PlaysBackwards) {
   make_recording();
   output({"play", file_, "--rate", "-1", "--from", "1.010", "--to", "1.020"});
@@ -1029,6 +1045,24 @@ TEST_F(RecordFleet, PlaysOnTheHostsOfTheStreams) {
     ASSERT_EQ(reader.wait_for_tid(0, kNever), WaitStatus::ready);
     EXPECT_EQ(reader.read_newest()->value.number, 3);
   }
+}
+
+TEST_F(RecordFleet, LeavesNoEmptyStreamsOnHostsWhenOneIsDown) {
+  const std::string file = folder_.file("a.mcap");
+  auto writer = RecordingWriter::create(file).value();
+  for (const char* host : {"pc2", "pc9"}) {
+    ASSERT_TRUE(writer.add_stream({{"pose", 0, host}, type_of<RecordedPose>(), 64, 1ms, 1, {}}));
+  }
+  const auto number =
+      writer.add_stream({{"pose", 0, "pc2"}, type_of<RecordedPose>(), 64, 1ms, 1, {}}).value();
+  const RecordedPose pose{1, 2, 3};
+  ASSERT_TRUE(writer.write(number, {0, at_ns(kSecond), 1us, sizeof pose}, 1us,
+                           std::as_bytes(std::span(&pose, 1))));
+  ASSERT_TRUE(writer.finish());
+  const Finished failed = ctl({"play", file, "--on-hosts"});
+  EXPECT_EQ(failed.exit_status, 1);
+  EXPECT_TRUE(contains(failed.err, "pc9")) << failed.err;
+  EXPECT_TRUE(on_pc2_.list_own_streams().value().empty());
 }
 
 // The playback clocks of all hosts while a recording is played.
