@@ -170,9 +170,6 @@ class Player {
         if (session_.stream_info(target.id)) DSSM_TRY(session_.remove(target.id));
       }
     }
-    for (std::size_t i = 0; i < streams.size(); ++i) {
-      if (target_of_[i]) DSSM_TRY(open(i));
-    }
     return set_properties(options_.rate < 0 ? range_.to : range_.from);
   }
 
@@ -296,8 +293,9 @@ class Player {
     StreamId id;      // with a host
     StreamId source;  // its name in the recording
     std::optional<RawWriter> writer = {};
-    bool is_created = false;   // by this program
-    bool has_samples = false;  // of this program
+    std::size_t opened_for = SIZE_MAX;  // stream of the recording: the incarnation that it has
+    bool is_created = false;            // by this program
+    bool has_samples = false;           // of this program
     Property property = {};
   };
 
@@ -340,23 +338,58 @@ class Player {
                              escaped(existing->id.str()), escaped(short_name(id)))};
   }
 
-  // Has the target of that stream of the recording take its samples.
+  // Has the target of that stream of the recording take its samples. If it came again with another
+  // type, the target is created again, as it was.
   Result<void> open(std::size_t from) {
     Target& target = this->target(from);
+    if (target.opened_for == from) return {};
     const RecordedStreamInfo& stream = recording_.streams()[from];
-    const History history{std::max(stream.depth, kMinDepth), stream.cycle};
-    const bool is_there = session_.stream_info(target.id).has_value();
-    target.writer =
-        DSSM_TRY(session_.create_raw(target.id, stream.type, history, {.keep_existing = true}));
-    target.is_created |= !is_there;
+    const bool is_open = target.writer && target.writer->type().check_usable_as(stream.type);
+    if (!is_open || target.writer->type().is_less_described_than(stream.type)) {
+      const Result<StreamInfo> existing = session_.stream_info(target.id);
+      if (existing && is_of_other_incarnation(target, existing->type, stream.type)) {
+        DSSM_TRY(remove_other_type(target, *existing, stream.type));
+      }
+      const History history{std::max(stream.depth, kMinDepth), stream.cycle};
+      target.writer =
+          DSSM_TRY(session_.create_raw(target.id, stream.type, history, {.keep_existing = true}));
+      target.is_created |= !existing;
+    }
+    target.opened_for = from;
     return {};
+  }
+
+  // Whether the target has the type of another incarnation, from this program or an earlier one.
+  bool is_of_other_incarnation(const Target& target, const TypeInfo& type,
+                               const TypeInfo& wanted) const {
+    if (type.check_usable_as(wanted)) return false;
+    return std::ranges::any_of(recording_.streams(), [&](const RecordedStreamInfo& stream) {
+      return stream.id == target.source && type.check_usable_as(stream.type);
+    });
+  }
+
+  Result<void> remove_other_type(Target& target, const StreamInfo& existing,
+                                 const TypeInfo& wanted) {
+    const std::uint32_t own_writers = target.writer ? 1 : 0;
+    if (existing.writers > own_writers) {
+      return Error{Errc::conflict,
+                   fmt::format("'{}' has another type in the recording from here on ({}, not {}), "
+                               "but another program writes it, too; end that, or give --map "
+                               "{}=OTHER",
+                               escaped(existing.id.str()), escaped(wanted.str()),
+                               escaped(existing.type.str()), escaped(short_name(target.id)))};
+    }
+    target.writer.reset();
+    target.property = {};
+    return session_.remove(existing.id);
   }
 
   // --- properties
 
-  // Has the stream that is played from stream `from` of the recording get the property that it had
-  // at `t`. One that it has from elsewhere stays until the recording has one.
+  // Has the stream that is played from stream `from` of the recording get the type and the property
+  // that it had at `t`. A property that it has from elsewhere stays until the recording has one.
   Result<void> set_property(std::size_t from, Time t) {
+    DSSM_TRY(open(from));
     Target& target = this->target(from);
     Property& set = target.property;
     const Property wanted{from, recording_.streams()[from].property_at(t)};
@@ -455,19 +488,38 @@ class Player {
     DSSM_TRY(set_properties(time));
     std::vector<std::byte> payload;
     for (const std::size_t i : incarnations_at(time)) {
-      Result<RecordedRawReader> reader = recording_.open_raw_reader(recording_.streams()[i].id);
-      if (!reader) continue;  // its type has changed on the way
+      const RecordedStreamInfo& stream = recording_.streams()[i];
+      if (stream.samples == 0 || stream.first_time > time) continue;
+      Result<RecordedRawReader> reader = recording_.open_raw_reader(stream.id);
+      if (!reader) {  // its type changes
+        DSSM_TRY(write_found(i, time, timeline));
+        continue;
+      }
       payload.resize(reader->payload_bytes());
       SampleInfo info;
       ReadStatus status = ReadStatus::restarted;
       while (status == ReadStatus::restarted) {
         status = reader->read_at(time, payload, info);
       }
-      if (status != ReadStatus::ok || info.time < range_.from || info.time > range_.to) continue;
+      if (status != ReadStatus::ok || !is_in_range(info.time)) continue;
       DSSM_TRY(write({i, info, kUnknownClockError, std::span(payload).first(info.payload_bytes)},
                      timeline.stamp(info.time)));
     }
     return {};
+  }
+
+  bool is_in_range(Time time) const { return time >= range_.from && time <= range_.to; }
+
+  // The sample that stream of the recording had at `time`, by going back to it.
+  Result<void> write_found(std::size_t stream, Time time, const Timeline& timeline) {
+    RecordingCursor cursor = recording_.cursor();
+    cursor.seek(saturating_add(time, Duration(1)));
+    RecordedSample sample;
+    do {
+      if (!cursor.previous(sample)) return {};
+    } while (sample.stream != stream || sample.info.time > time);
+    if (!is_in_range(sample.info.time)) return {};
+    return write(sample, timeline.stamp(sample.info.time));
   }
 
   Result<void> jump_to(Timeline& timeline, Time time) {

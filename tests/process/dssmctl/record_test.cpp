@@ -519,6 +519,21 @@ class Play : public Record {
     const SampleInfo info{number, at_ns(kSecond + number * 1'000'000), 1us, sizeof value};
     ASSERT_TRUE(writer.write(stream, info, 1us, std::as_bytes(std::span(&value, 1))));
   }
+  // Stream "pose" with samples 0 to 2 of write_poses() and a property; then with numbers 3 and 4.
+  void make_recording_of_two_types() {
+    auto writer = RecordingWriter::create(file_).value();
+    RecordedStream stream{{"pose", 0, "pc9"}, type_of<RecordedPose>(), 512, 1ms, 1, {}};
+    stream.property = {std::byte{7}};
+    const std::uint32_t number = writer.add_stream(stream).value();
+    for (std::int64_t i = 0; i < 3; ++i) {
+      const RecordedPose pose{0.5 * static_cast<double>(i), -1, i};
+      const SampleInfo info{i, at_ns(kSecond + i * 1'000'000), Duration(i), sizeof pose};
+      ASSERT_TRUE(writer.write(number, info, 1us, std::as_bytes(std::span(&pose, 1))));
+    }
+    for (const std::int64_t i : {3, 4}) write_number(writer, stream.id, i, 2);
+    ASSERT_TRUE(writer.finish());
+  }
+
   std::vector<std::string> own_streams() {
     std::vector<std::string> names;
     for (const StreamInfo& stream : session_.list_own_streams().value()) {
@@ -543,6 +558,10 @@ class Play : public Record {
       EXPECT_EQ(sample->info.clock_error, Duration(i));
     }
     EXPECT_FALSE(reader.read_next());
+  }
+  void expect_newest_pose(std::int64_t number) {
+    EXPECT_EQ(session_.open_reader<RecordedPose>("pose").value().read_newest()->value.number,
+              number);
   }
 };
 
@@ -730,6 +749,28 @@ TEST_F(Play, LeavesNoEmptyStreamsWhenItFails) {
   EXPECT_EQ(own_streams(), std::vector<std::string>{"other"});
 }
 
+TEST_F(Play, PlaysAStreamThatCameAgainWithAnotherType) {
+  make_recording_of_two_types();
+  for (int run = 0; run < 2; ++run) {  // the second one finds the stream with the last type
+    EXPECT_EQ(output({"play", file_}), file_ + ": 5 samples of 1 stream played\n");
+    auto reader = session_.open_reader<double>("pose").value();
+    reader.seek(kNoTid);
+    for (const double number : {3.0, 4.0}) EXPECT_EQ(reader.read_next()->value, number);
+    EXPECT_FALSE(reader.read_next());
+    EXPECT_EQ(property(), -1);
+  }
+  output({"play", file_, "--rate", "-1"});
+  expect_newest_pose(0);
+  EXPECT_EQ(property(), 7);
+  // Another program writes it beside: then the stream stays as it is.
+  const auto pose = session_.create<RecordedPose>("pose", depth_of(512)).value();
+  const Finished refused = ctl({"play", file_, "--force"});
+  EXPECT_EQ(refused.exit_status, 1);
+  EXPECT_TRUE(contains(refused.err, "'pose:0@pc1' has another type in the recording"))
+      << refused.err;
+  expect_newest_pose(2);
+}
+
 TEST_F(Play, PlaysBackwards) {
   make_recording();
   output({"play", file_, "--rate", "-1", "--from", "1.010", "--to", "1.020"});
@@ -858,6 +899,35 @@ TEST_F(PlayByKeys, ChangesSpeedAndDirection) {
   await([&] { return !clock_.setting().paused; });
   clock_.set_speed(-1000);
   for (const std::int64_t number : {2, 1, 0}) expect_next(number);
+  EXPECT_EQ(wait_for(std::exchange(pid_, -1)), 0);
+}
+
+TEST_F(PlayByKeys, HasTheTypeThatTheStreamHadThen) {
+  std::filesystem::remove(file_);
+  make_recording_of_two_types();
+  play({"--start-paused"});
+  const auto await_newest = [&]<class T>(const T&, std::int64_t number) {
+    await([&] {
+      read_some();
+      auto reader = session_.open_reader<T>("pose");
+      if (!reader) return false;
+      const auto sample = reader->read_newest();
+      if (!sample) return false;
+      if constexpr (std::is_same_v<T, double>) return sample->value == static_cast<double>(number);
+      if constexpr (!std::is_same_v<T, double>) return sample->value.number == number;
+    });
+  };
+  const auto await_pose = [&](std::int64_t number) { await_newest(RecordedPose{}, number); };
+  const auto await_number = [&](std::int64_t number) { await_newest(double{}, number); };
+  for (const std::int64_t number : {0, 1, 2}) press(kRight), await_pose(number);
+  press(kRight), await_number(3);
+  press(kLeft), await_pose(2);
+  EXPECT_EQ(property(), 7);
+  press(kRight), await_number(3);
+  EXPECT_EQ(property(), -1);
+  press(kHome), await_pose(0);
+  press(kPageDown), await_number(4);
+  press("q");
   EXPECT_EQ(wait_for(std::exchange(pid_, -1)), 0);
 }
 
