@@ -214,8 +214,14 @@ class Player {
     DSSM_TRY(begin(timeline, options_.rate, options_.start_paused));
     while (!out_.must_stop()) {
       show(timeline);
-      if (timeline.has_jumped()) DSSM_TRY(follow_jump(timeline.now(), timeline));
-      const bool backwards = timeline.speed() < 0;
+      const bool is_paused = timeline.is_paused(), backwards = timeline.speed() < 0;
+      const Time paused_at = timeline.now();
+      if (timeline.has_jumped()) {
+        DSSM_TRY(follow_jump(timeline.now(), timeline));
+      } else if (is_paused) {
+        DSSM_TRY(play_due(paused_at, backwards, timeline));
+      }
+      has_run_ = !is_paused;
       const RecordedSample* const next = course_.peek(backwards);
       if (!backwards) {
         const Time now = timeline.now();
@@ -223,7 +229,7 @@ class Player {
       }
       const Time end = backwards ? range_.from : range_.to;
       const Duration rest =
-          timeline.is_paused() ? Duration::max() : timeline.until(next ? next->info.time : end);
+          is_paused ? Duration::max() : timeline.until(next ? next->info.time : end);
       if (rest > Duration::zero()) {
         const Duration sleep = std::min(rest, kStopCheckPeriod);
         if (const auto key = keyboard_.wait(deadline_in(sleep))) {
@@ -476,15 +482,30 @@ class Player {
     const bool backwards = rate < 0;
     course_.seek(backwards ? saturating_add(range_.to, Duration(1)) : range_.from);
     last_stepped_.reset();
+    has_run_ = false;
     const Time start = backwards ? range_.to : range_.from;
     timeline.start(start, rate, paused);
     return set_properties(start);
+  }
+
+  // The time runs no longer, or not in this direction, but has reached `now` before: what other
+  // programs find by the clock is there.
+  Result<void> play_due(Time now, bool backwards, const Timeline& timeline) {
+    if (!std::exchange(has_run_, false)) return {};
+    while (const RecordedSample* const next = course_.peek(backwards)) {
+      const Time time = next->info.time;
+      if ((backwards ? time < now : time > now) || out_.must_stop()) break;
+      DSSM_TRY(play(*next, timeline.stamp(time)));
+      course_.taken();
+    }
+    return {};
   }
 
   // The time was set: programs get what the streams had then, as if all had been played so far.
   Result<void> follow_jump(Time time, const Timeline& timeline) {
     course_.seek(saturating_add(time, Duration(1)));
     last_stepped_.reset();
+    has_run_ = false;
     DSSM_TRY(set_properties(time));
     std::vector<std::byte> payload;
     for (const std::size_t i : incarnations_at(time)) {
@@ -549,9 +570,12 @@ class Player {
       case Key::down:
         set_rate(timeline.speed() / kFaster);
         break;
-      case Key::r:
+      case Key::r: {
+        const bool was_backwards = timeline.speed() < 0;
         set_rate(-timeline.speed());
+        DSSM_TRY(play_due(timeline.changed_at(), was_backwards, timeline));
         break;
+      }
       case Key::page_up:
         return jump_to(timeline, saturating_add(timeline.now(), -kJump));
       case Key::page_down:
@@ -567,6 +591,8 @@ class Player {
 
   // Pauses, and plays one sample.
   Result<void> step(Timeline& timeline, bool backwards) {
+    if (!timeline.is_paused()) timeline.set_paused(true);
+    DSSM_TRY(play_due(timeline.now(), timeline.speed() < 0, timeline));
     const RecordedSample* next = course_.peek(backwards);
     // After a step in the other direction it would be the one that was played last.
     if (next && last_stepped_ && last_stepped_->first != backwards &&
@@ -574,7 +600,7 @@ class Player {
       course_.taken();
       next = course_.peek(backwards);
     }
-    if (!next) return timeline.set_paused(true), Result<void>();
+    if (!next) return {};
     const Time time = next->info.time;
     timeline.start(time, timeline.speed(), true);
     DSSM_TRY(play(*next, timeline.stamp(time)));
@@ -612,7 +638,8 @@ class Player {
   std::vector<std::size_t> changing_;                  // streams whose property changes
   Course course_;
   std::optional<std::pair<bool, Time>> last_stepped_;  // backwards, and to which time
-  bool shows_now_ = false;                             // what a key has changed
+  bool has_run_ = false;    // the time, and not all that was due has been played
+  bool shows_now_ = false;  // what a key has changed
   std::uint64_t played_ = 0;
 };
 

@@ -22,6 +22,11 @@ double at(const PlaybackClock::Setting& setting, double real_s) {
   return setting.paused ? setting.paused_at_s : setting.speed * real_s + setting.offset_s;
 }
 
+Time time_from_seconds(double seconds) {
+  constexpr double kMaxSeconds = 9e9;  // 285 years: a Time has no more
+  return time_from_ns(std::llround(std::clamp(seconds, -kMaxSeconds, kMaxSeconds) * 1e9));
+}
+
 }  // namespace
 
 SharedPlayback::SharedPlayback(Session session, PlaybackClock clock,
@@ -79,11 +84,12 @@ void Timeline::change(std::optional<Time> time, std::optional<double> speed,
     known_real_s_ = seconds_of(from);
     known_ = clock_->change_at(from, time ? std::optional(seconds_of(*time)) : std::nullopt, speed,
                                paused);
+    changed_at_ = time_from_seconds(at(known_, known_real_s_));
     // What follows here works on what is then.
     if (lead_ > Duration::zero()) std::this_thread::sleep_for(lead_);
     return;
   }
-  base_time_ = time.value_or(now());
+  changed_at_ = base_time_ = time.value_or(now());
   base_real_ = WallClock::now();
   speed_ = speed.value_or(speed_);
   paused_ = paused.value_or(paused_);
@@ -96,8 +102,7 @@ Time Timeline::own_at(Time real) const {
 
 Time Timeline::now() const {
   if (!clock_) return own_at(WallClock::now());
-  constexpr double kMaxSeconds = 9e9;  // 285 years: a Time has no more
-  return time_from_ns(std::llround(std::clamp(clock_->now_s(), -kMaxSeconds, kMaxSeconds) * 1e9));
+  return time_from_seconds(clock_->now_s());
 }
 
 bool Timeline::has_jumped() {

@@ -70,6 +70,9 @@ class Timeline {
   // From then on, all at once.
   void start(Time time, double speed, bool paused) { change(time, speed, paused); }
 
+  // What time it was when the last of these changes came.
+  Time changed_at() const { return changed_at_; }
+
   // Whether another program has set the time since the last call: it is not what it would be if it
   // had run on. A change of speed alone is not a jump.
   bool has_jumped();
@@ -92,6 +95,7 @@ class Timeline {
   // that. What another program has changed since then is still to be found.
   Setting known_;
   double known_real_s_ = 0;
+  Time changed_at_{};
   // Without clock_: at that real time it was so late.
   Time base_real_{}, base_time_{};
   double speed_ = 1;

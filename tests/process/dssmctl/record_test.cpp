@@ -902,6 +902,55 @@ TEST_F(PlayByKeys, ChangesSpeedAndDirection) {
   EXPECT_EQ(wait_for(std::exchange(pid_, -1)), 0);
 }
 
+// Changes come 50 ms after their keys, on all hosts at the same moment.
+TEST_F(PlayByKeys, PlaysAllThatIsDueUntilItIsPausedOrTurns) {
+  play({"--start-paused", "--loop", "--rate", "0.1"});
+  // By the clock at that time.
+  const auto due = [](double now_s) {
+    return std::min<std::int64_t>((std::llround(now_s * 1e9) - kSecond) / 1'000'000, 99);
+  };
+  const auto newest = [&] {
+    read_some();
+    const auto sample = reader_->read_newest();
+    return sample ? sample->value.number : -1;
+  };
+  const auto await_pause = [&] {
+    double before = 0;
+    await([&] {
+      const double now = clock_.now_s();
+      // Not even for the next sample; but after the last one all begins again.
+      EXPECT_TRUE(now >= before || before >= 1.099) << before << " " << now;
+      before = now;
+      newest();
+      return clock_.setting().paused;
+    });
+    await([&] { return newest() == due(clock_.now_s()); });
+  };
+  for (const std::string_view key : {std::string_view(" "), kRight}) {
+    press(" ");
+    await([&] { return !clock_.setting().paused && newest() >= 10; });
+    press(key);
+    await_pause();
+  }
+  press(" ");
+  await([&] { return !clock_.setting().paused && newest() >= 10; });
+  press("r");
+  std::int64_t turned_at = 0;
+  await([&] {
+    turned_at = due(clock_.now_s());
+    newest();
+    return clock_.setting().speed < 0;
+  });
+  press("q");
+  EXPECT_EQ(wait_for(std::exchange(pid_, -1)), 0);
+  std::int64_t greatest = newest();
+  while (const auto sample = reader_->read_previous()) {
+    greatest = std::max(greatest, sample->value.number);
+    if (sample->value.number == 0) break;  // before that it began again
+  }
+  EXPECT_GE(greatest, turned_at);
+}
+
 TEST_F(PlayByKeys, HasTheTypeThatTheStreamHadThen) {
   std::filesystem::remove(file_);
   make_recording_of_two_types();
