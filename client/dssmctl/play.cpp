@@ -162,7 +162,7 @@ class Player {
         changing_.push_back(i);
       }
     }
-    if (targets_.empty()) return Error{Errc::not_found, "no stream of the recording fits"};
+    if (targets_.empty()) return nothing_fits();
     for (const Target& target : targets_) DSSM_TRY(check_writers(target.id));
     if (!options_.lockstep.empty()) {
       // All is the same each time, also what the rings hold at first.
@@ -293,6 +293,30 @@ class Player {
 
     friend bool operator==(const Property&, const Property&) = default;
   };
+
+  Error nothing_fits() const {
+    constexpr std::size_t kMaxNamed = 20;
+    std::vector<std::string> names;
+    for (const RecordedStreamInfo& stream : recording_.streams()) {
+      std::string name = stream.id.str();
+      if (std::ranges::find(names, name) == names.end()) names.push_back(std::move(name));
+    }
+    std::string more;
+    if (names.size() > kMaxNamed) {
+      more = fmt::format(", and {} more", names.size() - kMaxNamed);
+      names.resize(kMaxNamed);
+    }
+    const std::string there = list_text(names) + more;
+    if (options_.patterns.empty()) {
+      return {Errc::not_found,
+              fmt::format("'{}' has only streams of the black box, {}; they are played if a "
+                          "PATTERN names them",
+                          escaped(options_.file), there)};
+    }
+    return {Errc::not_found,
+            fmt::format("no stream of the recording fits {}; '{}' has {}",
+                        list_text(options_.patterns), escaped(options_.file), there)};
+  }
 
   // A stream here, which has the samples of one of the recording, of all its incarnations.
   struct Target {

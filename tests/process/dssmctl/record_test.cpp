@@ -644,7 +644,10 @@ TEST_F(Play, PlaysAPartUnderAnotherName) {
   const Finished nothing = ctl({"play", file_, "--from", "5"});
   EXPECT_EQ(nothing.exit_status, 2);
   EXPECT_TRUE(contains(nothing.err, "goes from 1.000000000 to 1.099000000")) << nothing.err;
-  EXPECT_TRUE(contains(ctl({"play", file_, "camera"}).err, "no stream of the recording fits"));
+  const Finished none = ctl({"play", file_, "camera", "scan*"});
+  EXPECT_EQ(none.exit_status, 1);
+  EXPECT_TRUE(contains(none.err, "no stream of the recording fits camera, scan*")) << none.err;
+  EXPECT_TRUE(contains(none.err, "'" + file_ + "' has pose:0@pc9\n")) << none.err;
 }
 
 TEST_F(Play, CountsTimesFromBothEnds) {
@@ -731,6 +734,13 @@ TEST_F(Play, LeavesOutTheStreamsOfTheBlackBox) {
   EXPECT_EQ(own_streams(), Names({"number", "old"}));
   output({"play", file_, "dssm_t*"});
   EXPECT_EQ(own_streams(), Names({"number", "old", "dssm_trigger"}));
+  const std::string only = folder_.file("b.mcap");
+  auto other = RecordingWriter::create(only).value();
+  write_number(other, {"dssm_trigger", 0, "pc9"}, 0);
+  ASSERT_TRUE(other.finish());
+  const Finished none = ctl({"play", only});
+  EXPECT_TRUE(contains(none.err, "has only streams of the black box, dssm_trigger:0@pc9;"))
+      << none.err;
 }
 
 // Else a program that creates one of them with another type would be refused.
