@@ -331,8 +331,9 @@ class Session {
   // Calls `on_event` for each existing stream, then for each one added or removed, until the watch
   // is destroyed. A stream that is recreated is reported as added again, and so is one whose
   // property was set or that was described (StreamEvent::property_set, StreamEvent::described). The
-  // calls come from the session's thread, and from watch() itself: `on_event` must return soon and must not call the session. After a
-  // reconnect only differences are reported; a property differs if its length does.
+  // calls come from the session's thread, and from watch() itself: `on_event` must return soon and
+  // must not call the session. After a reconnect only differences are reported; a property differs
+  // if its length does.
   class Watch {
    public:
     Watch(Watch&&) noexcept;
