@@ -4,9 +4,12 @@
 #pragma once
 
 #include <chrono>
+#include <condition_variable>
 #include <dssm/dssm.hpp>
+#include <mutex>
 #include <string>
 #include <thread>
+#include <vector>
 
 #include "tests/support/await.hpp"
 #include "tests/support/daemon_process.hpp"
@@ -34,5 +37,30 @@ inline Session connect_impatiently(const std::string& socket_path) {
 }
 
 inline Session connect(const DaemonProcess& daemon) { return connect_to(daemon.socket_path()); }
+
+// What a watch of the session reports from now on.
+class SeenEvents {
+ public:
+  explicit SeenEvents(Session& session)
+      : watch_(session
+                   .watch([this](const StreamEvent& event) {
+                     const std::lock_guard lock(mutex_);
+                     events_.push_back(event);
+                     changed_.notify_all();
+                   })
+                   .value()) {}
+  // All, as soon as there are so many.
+  std::vector<StreamEvent> await(std::size_t count) {
+    std::unique_lock lock(mutex_);
+    changed_.wait(lock, [&] { return events_.size() >= count; });
+    return events_;
+  }
+
+ private:
+  std::mutex mutex_;
+  std::condition_variable changed_;
+  std::vector<StreamEvent> events_;
+  Session::Watch watch_;  // the first to end: it calls the function above
+};
 
 }  // namespace dssm::test

@@ -9,7 +9,6 @@
 #include <array>
 #include <dssm/dssm.hpp>
 #include <filesystem>
-#include <mutex>
 #include <set>
 #include <thread>
 
@@ -22,6 +21,7 @@ namespace {
 
 using namespace std::chrono_literals;
 using test::DaemonProcess;
+using test::SeenEvents;
 
 struct Odometry {
   double x, y, theta;
@@ -441,40 +441,25 @@ TEST_F(Api, RemovesAStreamButNotFromThoseWhoHoldIt) {
 
 TEST_F(Api, NotifiesWatchersOfAddedAndRemovedStreams) {
   make("before");
-  std::mutex mutex;
-  std::condition_variable changed;
-  std::vector<std::string> seen;
-  auto watch = session.watch([&](const StreamEvent& event) {
-    const std::lock_guard guard(mutex);
-    seen.push_back((event.kind == StreamEvent::Kind::added ? "+" : "-") + event.stream.id.name);
-    changed.notify_all();
-  });
-  ASSERT_TRUE(watch);
+  SeenEvents watched(session);
   make("later");
   ASSERT_TRUE(session.remove({"before", 0, ""}));
-  std::unique_lock lock(mutex);
-  changed.wait(lock, [&] { return seen.size() >= 3; });
+  std::vector<std::string> seen;
+  for (const StreamEvent& event : watched.await(3)) {
+    seen.push_back((event.kind == StreamEvent::Kind::added ? "+" : "-") + event.stream.id.name);
+  }
   EXPECT_EQ(seen, (std::vector<std::string>{"+before", "+later", "-before"}));
 }
 
 TEST_F(Api, NotifiesWatchersOfPropertiesWithTheNewestSample) {
   auto writer = make("s");
-  std::mutex mutex;
-  std::condition_variable changed;
-  std::vector<StreamEvent> seen;
-  auto watch = session.watch([&](const StreamEvent& event) {
-    const std::lock_guard guard(mutex);
-    seen.push_back(event);
-    changed.notify_all();
-  });
-  ASSERT_TRUE(watch);
+  SeenEvents watched(session);
   const std::byte property[] = {std::byte{1}, std::byte{2}};
   ASSERT_TRUE(writer.set_property(property));
   for (int i = 0; i < 5; ++i) write(writer, i);
   ASSERT_TRUE(writer.set_property(property));  // the same bytes
   ASSERT_TRUE(writer.set_property({}));
-  std::unique_lock lock(mutex);
-  changed.wait(lock, [&] { return seen.size() >= 4; });
+  const std::vector<StreamEvent> seen = watched.await(4);
   EXPECT_FALSE(seen[0].property_set);
   const Tid newest[] = {kNoTid, kNoTid, 4, 4};
   const std::uint64_t bytes[] = {0, 2, 2, 0};
@@ -492,18 +477,9 @@ TEST_F(Api, NotifiesWatchersOfDescriptions) {
   const TypeInfo type = type_of<Odometry>();
   const TypeInfo bytes{"", type.payload_bytes, type.alignment_bytes, {}};
   const RawWriter writer = session.create_raw({"s", 0, ""}, bytes, History{4, 10ms}).value();
-  std::mutex mutex;
-  std::condition_variable changed;
-  std::vector<StreamEvent> seen;
-  auto watch = session.watch([&](const StreamEvent& event) {
-    const std::lock_guard guard(mutex);
-    seen.push_back(event);
-    changed.notify_all();
-  });
-  ASSERT_TRUE(watch);
+  SeenEvents watched(session);
   ASSERT_TRUE(session.describe(writer.id(), type));
-  std::unique_lock lock(mutex);
-  changed.wait(lock, [&] { return seen.size() >= 2; });
+  const std::vector<StreamEvent> seen = watched.await(2);
   EXPECT_FALSE(seen[0].described);
   EXPECT_TRUE(seen[1].described);
   EXPECT_FALSE(seen[1].property_set);

@@ -88,20 +88,11 @@ TEST_F(FleetCatalog, NotifiesWatchersOfAddedAndRemovedStreamsOfAllHosts) {
 TEST_F(FleetCatalog, NotifiesWatchersOfPropertiesOnOtherHosts) {
   auto two = on2.create<double>("lidar", kHistory).value();
   await_list(on1, {"lidar:0@pc2"});
-  std::mutex mutex;
-  std::condition_variable changed;
-  std::vector<StreamEvent> seen;
-  auto watch = on1.watch([&](const StreamEvent& event) {
-    const std::lock_guard guard(mutex);
-    seen.push_back(event);
-    changed.notify_all();
-  });
-  ASSERT_TRUE(watch);
+  SeenEvents watched(on1);
   for (int i = 0; i < 3; ++i) two.write(i);
   const std::byte property[] = {std::byte{1}, std::byte{2}};
   ASSERT_TRUE(two.set_property(property));
-  std::unique_lock lock(mutex);
-  changed.wait(lock, [&] { return seen.size() >= 2; });
+  const std::vector<StreamEvent> seen = watched.await(2);
   EXPECT_FALSE(seen[0].property_set);
   EXPECT_TRUE(seen[1].property_set);
   EXPECT_EQ(seen[1].stream.id.str(), "lidar:0@pc2");
