@@ -13,6 +13,7 @@
 #include <functional>
 #include <map>
 #include <optional>
+#include <ranges>
 #include <string_view>
 #include <utility>
 
@@ -455,9 +456,8 @@ class Player {
       if (stream.samples > 0 && stream.first_time <= t) streams[*target_of_[i]] = i;
       streams.try_emplace(*target_of_[i], i);
     }
-    std::vector<std::size_t> all;
-    for (const auto& [target, stream] : streams) all.push_back(stream);
-    return all;
+    const auto values = std::views::values(streams);
+    return {values.begin(), values.end()};
   }
 
   // At the end of what is played: also those that were set after the last sample.
@@ -704,7 +704,7 @@ Result<void> run(const PlayOptions& options, Output& out) {
     tell_warnings();
     return played;
   };
-  const Result<void> played = play();
+  Result<void> played = play();
   if (!played) player.remove_empty_streams();
   return played;
 }
