@@ -179,18 +179,14 @@ std::optional<ProgramType> obvious_type_of_programs(Session& session, const Stre
   return *std::move(type);
 }
 
-std::string obvious_text(const StreamId& id, const TypeInfo& type, std::string_view source,
-                         std::string_view done) {
-  return fmt::format("'{0}' is {1} as {2} of {3}; `dssmctl describe {0}` shows it so everywhere",
-                     escaped(id.str()), done, escaped(type.str()), source);
-}
-
 TypeInfo obvious_type(Session& session, const RawReader& reader, std::string_view verb) {
   if (!reader.type().fields.empty()) return {};
   const auto type = obvious_type_of_programs(session, reader.id());
   if (!type) return {};
-  print_error(fmt::format("dssmctl: {}: {}\n", verb,
-                          obvious_text(reader.id(), type->found.type, type->source, "shown")));
+  print_error(fmt::format(
+      "dssmctl: {}: '{}' is shown as {} of {}; `dssmctl describe {}` shows it so everywhere\n",
+      verb, escaped(reader.id().str()), escaped(type->found.type.str()), type->source,
+      escaped(reader.id().str())));
   return type->found.type;
 }
 

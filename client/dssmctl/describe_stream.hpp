@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The type of a stream whose programs do not describe it, from the debug information of those
-// programs: for `dssmctl describe`, and for what `echo`, `record` and dssm-view show.
+// programs: for `dssmctl describe`, and for what `echo` and dssm-view show.
 #pragma once
 
 #include <dssm/session.hpp>
@@ -28,10 +28,6 @@ Result<ProgramType> type_of_programs(Session& session, const StreamInfo& stream,
 // type or because it is the T of an SSMApi<T, P>, and only of programs whose files are root's or
 // the user's own.
 std::optional<ProgramType> obvious_type_of_programs(Session& session, const StreamId& id);
-
-// A line for people: `done` ("shown") as `type` of `source`.
-std::string obvious_text(const StreamId& id, const TypeInfo& type, std::string_view source,
-                         std::string_view done);
 
 // The same for a verb that shows samples of the reader's stream, if it is not described. A line on
 // standard error names the type and its program.

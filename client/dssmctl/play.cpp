@@ -412,7 +412,10 @@ class Player {
     }
     target.writer.reset();
     target.property = {};
-    return session_.remove(existing.id);
+    DSSM_TRY(session_.remove(existing.id));
+    target.is_created = true;
+    target.has_samples = false;
+    return {};
   }
 
   // --- properties
@@ -580,6 +583,8 @@ class Player {
     const auto set_rate = [&](double rate) {
       timeline.set_speed(std::copysign(std::clamp(std::fabs(rate), kMinRate, kMaxRate), rate));
     };
+    // Before the key changes the time: what lies between is not due.
+    if (timeline.has_jumped()) DSSM_TRY(follow_jump(timeline.now(), timeline));
     switch (key) {
       case Key::space:
         timeline.set_paused(!timeline.is_paused());

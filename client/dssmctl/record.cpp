@@ -227,7 +227,11 @@ Result<void> run(const RecordOptions& options, Output& out) {
 }
 
 Result<void> prepare(RecordingFolder& folder) {
-  DSSM_TRY(folder.make_room(0));
+  const Result<void> room = folder.make_room(0);
+  for (const std::string& text : folder.take_notices()) {
+    print_error(fmt::format("dssmctl: record: {}\n", text));
+  }
+  DSSM_TRY(room);
   const Result<std::filesystem::path> repaired = folder.repair_newest();
   if (!repaired || !repaired->empty()) {
     print_error(fmt::format("dssmctl: record: {}\n",

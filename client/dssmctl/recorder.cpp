@@ -66,16 +66,12 @@ Result<void> Recorder::Opener::begin() {
   return {};
 }
 
-// A type without a name may get one when its stream is opened.
 bool Recorder::Opener::wants(const StreamInfo& stream) const {
   return plan_.filter.takes(stream.id) &&
-         (stream.type.name.empty() || wants_type(stream.type.name));
-}
-
-bool Recorder::Opener::wants_type(const std::string& name) const {
-  return plan_.types.empty() || std::ranges::any_of(plan_.types, [&](const std::string& type) {
-           return ::fnmatch(type.c_str(), name.c_str(), 0) == 0;
-         });
+         (plan_.types.empty() ||
+          std::any_of(plan_.types.begin(), plan_.types.end(), [&](const std::string& type) {
+            return ::fnmatch(type.c_str(), stream.type.name.c_str(), 0) == 0;
+          }));
 }
 
 void Recorder::Opener::on_event(const StreamEvent& event) {
@@ -85,9 +81,7 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
     const auto known = known_.find(name);
     if (event.property_set) {
       want_property({event.stream, event.property_after, MonoClock::now()});
-    } else if (event.described) {
-      described_.insert_or_assign(name, event.stream.type);
-    } else if (known != known_.end() && event.stream.property_bytes > 0) {
+    } else if (known != known_.end() && !event.described && event.stream.property_bytes > 0) {
       // It was created again, or its host is there again. Its reader continues.
       const bool is_new = known->second != event.stream.incarnation;
       want_property(
@@ -95,9 +89,11 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
     }
     if (known != known_.end()) known->second = event.stream.incarnation;
   }
+  if (event.described) described_[name] = {event.stream.incarnation, event.stream.type};
   const auto is_it = [&](const Wanted& wanted) { return wanted.stream.id == event.stream.id; };
   std::erase_if(removed_, [&](const auto& entry) { return entry.first == event.stream.id; });
   if (event.kind == StreamEvent::Kind::removed) {
+    described_.erase(name);
     if (known_.contains(name)) removed_.emplace_back(event.stream.id, MonoClock::now());
     untried_ -= static_cast<std::size_t>(
         std::count_if(wanted_.begin(), wanted_.end(), [&](const Wanted& wanted) {
@@ -111,8 +107,10 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
     return;
   }
   if (plan_.range && !is_beginning_) return;
-  untried_ += is_beginning_;
-  wanted_.push_back({event.stream, MonoClock::now(), is_beginning_, false});
+  // One that fits since it was described was there, too.
+  const bool was_there = is_beginning_ || event.described;
+  untried_ += was_there;
+  wanted_.push_back({event.stream, MonoClock::now(), was_there, false});
   changed_.notify_one();
 }
 
@@ -212,7 +210,6 @@ void Recorder::Opener::run() {
     const Wanted wanted = *next;
     lock.unlock();
     Result<Source> opened = open(wanted);
-    if (opened) find_type(*opened);
     lock.lock();
     // It may have been removed meanwhile, and created again.
     const auto entry = std::find_if(wanted_.begin(), wanted_.end(), [&](const Wanted& other) {
@@ -220,10 +217,6 @@ void Recorder::Opener::run() {
     });
     const bool is_wanted = entry != wanted_.end();
     if (is_wanted && entry->from_start && !entry->reported) --untried_;
-    if (opened && !wants_type(opened->type().name)) {  // until it is described, maybe
-      if (is_wanted) wanted_.erase(entry);
-      continue;
-    }
     if (opened) {  // the reader has the samples of its ring, and follows a new one
       known_[wanted.stream.id.str()] = wanted.stream.incarnation;
       if (is_wanted) wanted_.erase(entry);
@@ -253,7 +246,7 @@ Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
   RawReader reader = DSSM_TRY(
       session.open_raw_reader(wanted.stream.id, nullptr, 0,
                               with_history ? FetchHistory::at_once : FetchHistory::when_read));
-  Source source{std::move(reader), 0, kNoTid, kNoTid, {}, {}, true, {}, {}, {}};
+  Source source{std::move(reader), 0, kNoTid, kNoTid, {}, {}, true, {}, {}};
   if (property) source.property = *std::move(property);
   const Tid newest = source.reader.newest_tid();
   // The stamps of a recording that is being played are of another time than now. What lists say of
@@ -283,16 +276,6 @@ Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
   return source;
 }
 
-void Recorder::Opener::find_type(Source& source) {
-  const StreamId id = source.reader.id();
-  if (!source.reader.type().fields.empty()) return;
-  std::optional<ProgramType> type = obvious_type_of_programs(session_, id);
-  if (!type) return;
-  source.obvious = std::move(type->found.type);
-  const std::lock_guard lock(mutex_);
-  notices_.push_back(obvious_text(id, source.obvious, type->source, "recorded"));
-}
-
 std::vector<Recorder::Source> Recorder::Opener::take_opened() {
   const std::lock_guard lock(mutex_);
   return std::exchange(opened_, {});
@@ -303,9 +286,12 @@ std::vector<std::pair<StreamId, Recorder::NewProperty>> Recorder::Opener::take_p
   return std::exchange(properties_, {});
 }
 
-std::map<std::string, TypeInfo> Recorder::Opener::take_described() {
+std::optional<TypeInfo> Recorder::Opener::described(const StreamId& id,
+                                                    std::uint64_t incarnation) const {
   const std::lock_guard lock(mutex_);
-  return std::exchange(described_, {});
+  const auto found = described_.find(id.str());
+  if (found == described_.end() || found->second.first != incarnation) return std::nullopt;
+  return found->second.second;
 }
 
 std::vector<std::string> Recorder::Opener::take_notices() {
@@ -338,7 +324,6 @@ Result<void> Recorder::begin(RecordingWriter file, Duration before) {
   before_ = before;
   past_moved_ = MonoClock::now();
   period_ = kMinPeriod;
-  take_descriptions();
   for (Source& source : sources_) {
     want_past(source);
     if (Result<void> added = add_to_file(source); !added) {
@@ -375,7 +360,6 @@ Result<void> Recorder::take_until(Time held_from) {
     if (Result<void> one = add(std::move(opened)); !one && added) added = std::move(one);
   }
   for (auto& [id, property] : properties) add_property(id, std::move(property));
-  take_descriptions();
   DSSM_TRY(std::move(added));
   if (!is_recording_) {
     check_readers();
@@ -428,19 +412,13 @@ Result<void> Recorder::add(Source source) {
 
 Result<void> Recorder::add_to_file(Source& source) {
   const RawReader& reader = source.reader;
-  source.number =
-      DSSM_TRY(file_->add_stream({reader.id(), source.type(), reader.depth(), reader.cycle(),
-                                  reader.incarnation(), source.property}));
+  // It may have been described since it was opened.
+  const TypeInfo type =
+      opener_.described(reader.id(), reader.incarnation()).value_or(reader.type());
+  source.number = DSSM_TRY(file_->add_stream(
+      {reader.id(), type, reader.depth(), reader.cycle(), reader.incarnation(), source.property}));
+  source.has_fields = !type.fields.empty();
   return {};
-}
-
-// A file that has begun keeps its channels; the next one has the fields.
-void Recorder::take_descriptions() {
-  for (auto& [name, type] : opener_.take_described()) {
-    const auto source =
-        std::ranges::find(sources_, name, [](const Source& one) { return one.reader.id().str(); });
-    if (source != sources_.end()) source->obvious = std::move(type);
-  }
 }
 
 void Recorder::add_property(const StreamId& id, NewProperty property) {
@@ -649,7 +627,7 @@ bool Recorder::has_past() const {
 std::vector<std::string> Recorder::streams_without_fields() const {
   std::vector<std::string> names;
   for (const Source& source : sources_) {
-    if (source.type().fields.empty()) names.push_back(source.reader.id().str());
+    if (!source.has_fields) names.push_back(source.reader.id().str());
   }
   return names;
 }

@@ -24,7 +24,6 @@
 #include <utility>
 #include <vector>
 
-#include "client/dssmctl/describe_stream.hpp"
 #include "client/dssmctl/names.hpp"
 
 namespace dssm::ctl {
@@ -85,8 +84,7 @@ class Recorder {
   bool is_past_late();
 
   std::size_t streams() const { return sources_.size(); }
-  // Those that are not described, and whose programs do not show what they write: of them the file
-  // has only bytes.
+  // Those of which the file has only bytes: they were not described.
   std::vector<std::string> streams_without_fields() const;
   // Of the file, or of the last one; there was one.
   RecordingProgress progress() const { return file_->progress(); }
@@ -147,10 +145,7 @@ class Recorder {
     bool is_of_now = true;            // its stamps are of this time, and not of one that is played
     std::vector<std::byte> property;  // that the file has, or gets at its beginning
     std::vector<NewProperty> new_properties;  // the file has not yet
-    // If it was not described when it was opened: as it was since, or obvious_type_of_programs().
-    TypeInfo obvious;
-
-    const TypeInfo& type() const { return type_to_show(reader.type(), obvious); }
+    bool has_fields = false;                  // in the file
   };
   static Time past_of(const Source& source, Time now, Duration past);
 
@@ -175,8 +170,8 @@ class Recorder {
     std::vector<Source> take_opened();
     // To be called before take_opened(), which then has their streams.
     std::vector<std::pair<StreamId, NewProperty>> take_properties();
-    // Types of streams, by their names, that were described since the last call.
-    std::map<std::string, TypeInfo> take_described();
+    // The stream's type, if it was described since begin().
+    std::optional<TypeInfo> described(const StreamId& id, std::uint64_t incarnation) const;
     std::vector<std::string> take_notices();
     bool has_tried_all() const;  // of the streams that there were at begin()
 
@@ -198,12 +193,9 @@ class Recorder {
     // The one to try next; the end: none.
     std::vector<Wanted>::iterator next_wanted();
     bool wants(const StreamInfo& stream) const;
-    bool wants_type(const std::string& name) const;
     void on_event(const StreamEvent& event);
     void run();
     Result<Source> open(const Wanted& wanted) const;
-    // The type of its programs, and a notice, if it is not described.
-    void find_type(Source& source);
 
     Session session_;
     RecorderPlan plan_;
@@ -220,7 +212,8 @@ class Recorder {
     std::vector<Source> opened_;
     std::vector<SetProperty> set_properties_;                   // the last change of each stream
     std::vector<std::pair<StreamId, NewProperty>> properties_;  // fetched
-    std::map<std::string, TypeInfo> described_;                 // by name
+    // Incarnations and types, by the streams' names.
+    std::map<std::string, std::pair<std::uint64_t, TypeInfo>> described_;
     std::vector<std::string> notices_;
     std::optional<MonoTime> stop_at_;
 
@@ -238,7 +231,6 @@ class Recorder {
   Duration next_period();
   Result<void> add(Source source);
   Result<void> add_to_file(Source& source);
-  void take_descriptions();
   void want_past(Source& source) const;
   // take(); samples that are later than `held_from` may wait for earlier ones of other streams.
   Result<void> take_until(Time held_from);

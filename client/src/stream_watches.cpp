@@ -84,7 +84,8 @@ void StreamWatches::on_event(const proto::StreamEvent& message) {
     if (!is_new && known.incarnation == event.stream.incarnation) {
       event.property_set =
           message.property_set() || known.property_bytes != event.stream.property_bytes;
-      event.described = known.type.is_less_described_than(event.stream.type);
+      event.described =
+          known.type != event.stream.type && !event.stream.type.is_less_described_than(known.type);
       if (!event.property_set && !event.described) return;
       if (message.property_set()) event.property_after = event.stream.newest;
     }

@@ -177,7 +177,7 @@ struct StreamEvent {
   // For property_set: samples after this one are written with the new property; kNoTid: all are.
   // Empty: that is not known, after a reconnect.
   std::optional<Tid> property_after;
-  // Added: the stream was known before, and its type has a name or fields now that it had not.
+  // Added: the stream was known before, and its type has another description now.
   bool described = false;
 };
 

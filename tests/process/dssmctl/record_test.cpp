@@ -913,6 +913,24 @@ TEST_F(PlayByKeys, ChangesSpeedAndDirection) {
 }
 
 // Changes come 50 ms after their keys, on all hosts at the same moment.
+TEST_F(PlayByKeys, LeavesOutWhatAJumpSkippedWhenAKeyFollowsIt) {
+  play({"--start-paused", "--rate", "0.001"});
+  press(" ");
+  await([&] { return !clock_.setting().paused; });
+  expect_next(0);
+  clock_.set_time(1.0905);  // as another program may do
+  press(" ");
+  await([&] {
+    read_some();
+    const auto newest = reader_->read_newest();
+    return clock_.setting().paused && newest && newest->value.number >= 90;
+  });
+  while (const auto sample = reader_->read_next()) {
+    // One is due each second.
+    EXPECT_TRUE(sample->value.number < 45 || sample->value.number >= 90) << sample->value.number;
+  }
+}
+
 TEST_F(PlayByKeys, PlaysAllThatIsDueUntilItIsPausedOrTurns) {
   play({"--start-paused", "--loop", "--rate", "0.1"});
   // By the clock at that time.

@@ -28,7 +28,8 @@ struct Pc {
   ClockLine line;
   ClockReading rate_from;
   int lines = 0;
-  double blur_ns = 0;  // of its readings, which are wrong by a tenth of that at most
+  double blur_ns = 0;  // of its readings
+  double wrong = 0.1;  // they are wrong by this part of that at most
   std::mt19937 random{7};
 
   void pass(double true_ns) {
@@ -44,8 +45,8 @@ struct Pc {
     line = ClockLine::through(rate_from, line.rate);
   }
   ClockReading reading() {
-    const double wrong = std::uniform_real_distribution<double>(-blur_ns, blur_ns)(random) / 10;
-    return {raw() + ns(wrong), wall(), ns(blur_ns)};
+    const double off_ns = std::uniform_real_distribution<double>(-blur_ns, blur_ns)(random) * wrong;
+    return {raw() + ns(off_ns), wall(), ns(blur_ns)};
   }
   // As FleetClock does before each batch of samples.
   void keep_line() {
@@ -310,6 +311,17 @@ class WallDifferenceTest : public PairMeasurementTest {
     EXPECT_LE(static_cast<double>(to_ns(found.least)), true_walls_ns() + 1000);
     EXPECT_GE(static_cast<double>(to_ns(found.greatest)), true_walls_ns() - 1000);
   }
+  // While their clock is slewed as fast as chronyd can.
+  void expect_bounds_of_a_slew() {
+    theirs.correction = 0.083;
+    ours.keep_line();
+    for (int i = 0; i < 300; ++i) {
+      beat(1e4);
+      for (int j = 0; j < 3; ++j) pass_and_keep_lines(3e5);
+      pass_and_keep_lines(3e7);
+      if (i >= 3) expect_true_walls();
+    }
+  }
 };
 
 TEST_F(WallDifferenceTest, IsWithinTheBoundsWhileBothAreSlewedAndSet) {
@@ -331,18 +343,14 @@ TEST_F(WallDifferenceTest, IsWithinTheBoundsWhileBothAreSlewedAndSet) {
 // As in a guest of User Mode Linux. Lines that are not needed would be worse than the first ones.
 TEST_F(WallDifferenceTest, AClockThatIsReadSlowlyStaysOnItsLine) {
   theirs.blur_ns = 5e3;
-  theirs.correction = 0.083;
-  ours.keep_line();
-  for (int i = 0; i < 300; ++i) {
-    beat(1e4);
-    for (int j = 0; j < 3; ++j) pass_and_keep_lines(3e5);
-    pass_and_keep_lines(3e7);
-    if (i < 3) continue;
-    const WallDifference found = walls();
-    EXPECT_LE(static_cast<double>(to_ns(found.least)), true_walls_ns() + 1000);
-    EXPECT_GE(static_cast<double>(to_ns(found.greatest)), true_walls_ns() - 1000);
-  }
+  expect_bounds_of_a_slew();
   EXPECT_LE(theirs.lines, 6);
+}
+
+TEST_F(WallDifferenceTest, HoldsForReadingsThatAreAsWrongAsTheyMayBe) {
+  theirs.blur_ns = 5e3;
+  theirs.wrong = 1;
+  expect_bounds_of_a_slew();
 }
 
 TEST_F(WallDifferenceTest, BetweenTwoReadingsItGrowsNoFasterThanTheAgeing) {
