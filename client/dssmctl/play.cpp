@@ -13,7 +13,6 @@
 #include <functional>
 #include <map>
 #include <optional>
-#include <ranges>
 #include <string_view>
 #include <utility>
 
@@ -459,8 +458,10 @@ class Player {
       if (stream.samples > 0 && stream.first_time <= t) streams[*target_of_[i]] = i;
       streams.try_emplace(*target_of_[i], i);
     }
-    const auto values = std::views::values(streams);
-    return {values.begin(), values.end()};
+    std::vector<std::size_t> all;
+    all.reserve(streams.size());
+    for (const auto& [target, stream] : streams) all.push_back(stream);
+    return all;
   }
 
   // At the end of what is played: also those that were set after the last sample.
