@@ -179,8 +179,7 @@ class Player {
     for (Target& target : targets_) {
       if (!target.is_created || target.has_samples) continue;
       const Result<StreamInfo> info = session_.stream_info(target.id);
-      const std::uint32_t own_writers = target.writer ? 1 : 0;
-      if (!info || info->newest != kNoTid || info->writers > own_writers) continue;
+      if (!info || info->newest != kNoTid || has_other_writers(target, *info)) continue;
       target.writer.reset();
       if (const Result<void> removed = session_.remove(target.id); !removed) {
         print_notice(
@@ -301,12 +300,7 @@ class Player {
       std::string name = stream.id.str();
       if (std::ranges::find(names, name) == names.end()) names.push_back(std::move(name));
     }
-    std::string more;
-    if (names.size() > kMaxNamed) {
-      more = fmt::format(", and {} more", names.size() - kMaxNamed);
-      names.resize(kMaxNamed);
-    }
-    const std::string there = list_text(names) + more;
+    const std::string there = list_text(names, kMaxNamed);
     if (options_.patterns.empty()) {
       return {Errc::not_found,
               fmt::format("'{}' has only streams of the black box, {}; they are played if a "
@@ -330,6 +324,10 @@ class Player {
   };
 
   Target& target(std::size_t stream) { return targets_[*target_of_[stream]]; }
+
+  static bool has_other_writers(const Target& target, const StreamInfo& now) {
+    return now.writers > (target.writer ? 1U : 0U);
+  }
 
   // Requests to the black box that are in the recording would be requests to the one here.
   bool is_wanted(const StreamId& id) const {
@@ -400,8 +398,7 @@ class Player {
 
   Result<void> remove_other_type(Target& target, const StreamInfo& existing,
                                  const TypeInfo& wanted) {
-    const std::uint32_t own_writers = target.writer ? 1 : 0;
-    if (existing.writers > own_writers) {
+    if (has_other_writers(target, existing)) {
       return Error{Errc::conflict,
                    fmt::format("'{}' has another type in the recording from here on ({}, not {}), "
                                "but another program writes it, too; end that, or give --map "
@@ -516,8 +513,8 @@ class Player {
     return set_properties(start);
   }
 
-  // The time runs no longer, or not in this direction, but has reached `now` before: what other
-  // programs find by the clock is there.
+  // The timeline has stopped or turned, at `now`. What is due until then is played, because other
+  // programs may read by that time.
   Result<void> play_due(Time now, bool backwards, const Timeline& timeline) {
     if (!std::exchange(has_run_, false)) return {};
     while (const RecordedSample* const next = course_.peek(backwards)) {
@@ -668,7 +665,7 @@ class Player {
   std::vector<std::size_t> changing_;                  // streams whose property changes
   Course course_;
   std::optional<std::pair<bool, Time>> last_stepped_;  // backwards, and to which time
-  bool has_run_ = false;    // the time, and not all that was due has been played
+  bool has_run_ = false;    // the timeline, since all that was due was played
   bool shows_now_ = false;  // what a key has changed
   std::uint64_t played_ = 0;
 };

@@ -46,10 +46,12 @@ Result<void> check_output(const RecordOptions& options) {
   DSSM_TRY(check_folder(options.black_box || options.file.ends_with('/') ? output
                                                                          : output.parent_path()));
   if (!is_limited || options.file.empty() || is_folder(options.file)) return {};
-  return Error{Errc::invalid_argument,
-               fmt::format("{} names its recordings itself, in the folder of --output; '{}' is no "
-                           "folder (--max-total-size limits the files of one recording)",
-                           options.black_box ? "--black-box" : "--quota", escaped(options.file))};
+  return Error{
+      Errc::invalid_argument,
+      fmt::format(
+          "{} names its recordings itself, in the folder of --output; '{}' is no folder{}",
+          options.black_box ? "--black-box" : "--quota", escaped(options.file),
+          options.black_box ? "" : " (--max-total-size limits the files of one recording)")};
 }
 
 std::filesystem::path file_of(const RecordOptions& options) {

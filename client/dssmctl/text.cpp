@@ -277,9 +277,12 @@ std::string escaped(std::string_view bytes) { return escape(bytes, "\\"); }
 
 std::string escaped_message(std::string_view message) { return escape(message, ""); }
 
-std::string list_text(const std::vector<std::string>& texts) {
+std::string list_text(const std::vector<std::string>& texts, std::size_t at_most) {
   std::string out;
-  for (const std::string& text : texts) out.append(out.empty() ? "" : ", ").append(escaped(text));
+  for (std::size_t i = 0; i < std::min(texts.size(), at_most); ++i) {
+    out.append(out.empty() ? "" : ", ").append(escaped(texts[i]));
+  }
+  if (texts.size() > at_most) out += fmt::format(", and {} more", texts.size() - at_most);
   return out;
 }
 

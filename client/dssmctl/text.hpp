@@ -36,8 +36,8 @@ std::size_t columns_of(std::string_view text);
 // Escaped text, cut to so many columns at most, and then with three dots at its end.
 std::string shortened(std::string_view text, std::size_t columns);
 
-// `texts`, escaped, with commas between them: "a, b".
-std::string list_text(const std::vector<std::string>& texts);
+// The first `at_most` of `texts`, escaped: "a, b" or "a, b, and 3 more".
+std::string list_text(const std::vector<std::string>& texts, std::size_t at_most = SIZE_MAX);
 
 // `text`, or "-" when it is empty.
 std::string or_dash(const std::string& text);

@@ -492,20 +492,28 @@ TEST_F(Record, SaysWhatIsWrong) {
 
 class Play : public Record {
  protected:
+  // Stream "pose", with a property; returns its number.
+  static std::uint32_t add_pose(RecordingWriter& writer) {
+    RecordedStream stream{{"pose", 0, "pc9"}, type_of<RecordedPose>(), 512, 1ms, 1, {}};
+    stream.property = {std::byte{7}};
+    return writer.add_stream(stream).value();
+  }
+  // Sample `i` of write_poses().
+  static void write_pose(RecordingWriter& writer, std::uint32_t stream, std::int64_t i) {
+    const RecordedPose pose{0.5 * static_cast<double>(i), -1, i};
+    const SampleInfo info{i, at_ns(kSecond + i * 1'000'000), Duration(i), sizeof pose};
+    ASSERT_TRUE(writer.write(stream, info, 1us, std::as_bytes(std::span(&pose, 1))));
+  }
   // A recording of samples 0 to 99 of write_poses() in stream "pose", with one property, and from
   // sample 50 on another one.
   void make_recording() {
     auto writer = RecordingWriter::create(file_).value();
-    RecordedStream stream{{"pose", 0, "pc9"}, type_of<RecordedPose>(), 512, 1ms, 1, {}};
-    stream.property = {std::byte{7}};
-    const std::uint32_t number = writer.add_stream(stream).value();
+    const std::uint32_t number = add_pose(writer);
     for (std::int64_t i = 0; i < 100; ++i) {
       if (i == 50) {
         ASSERT_TRUE(writer.set_property(number, std::vector{std::byte{8}}));
       }
-      const RecordedPose pose{0.5 * static_cast<double>(i), -1, i};
-      const SampleInfo info{i, at_ns(kSecond + i * 1'000'000), Duration(i), sizeof pose};
-      ASSERT_TRUE(writer.write(number, info, 1us, std::as_bytes(std::span(&pose, 1))));
+      write_pose(writer, number, i);
     }
     ASSERT_TRUE(writer.finish());
   }
@@ -522,15 +530,9 @@ class Play : public Record {
   // Stream "pose" with samples 0 to 2 of write_poses() and a property; then with numbers 3 and 4.
   void make_recording_of_two_types() {
     auto writer = RecordingWriter::create(file_).value();
-    RecordedStream stream{{"pose", 0, "pc9"}, type_of<RecordedPose>(), 512, 1ms, 1, {}};
-    stream.property = {std::byte{7}};
-    const std::uint32_t number = writer.add_stream(stream).value();
-    for (std::int64_t i = 0; i < 3; ++i) {
-      const RecordedPose pose{0.5 * static_cast<double>(i), -1, i};
-      const SampleInfo info{i, at_ns(kSecond + i * 1'000'000), Duration(i), sizeof pose};
-      ASSERT_TRUE(writer.write(number, info, 1us, std::as_bytes(std::span(&pose, 1))));
-    }
-    for (const std::int64_t i : {3, 4}) write_number(writer, stream.id, i, 2);
+    const std::uint32_t number = add_pose(writer);
+    for (const std::int64_t i : {0, 1, 2}) write_pose(writer, number, i);
+    for (const std::int64_t i : {3, 4}) write_number(writer, {"pose", 0, "pc9"}, i, 2);
     ASSERT_TRUE(writer.finish());
   }
 

@@ -104,6 +104,8 @@ TEST(Text, WritesListsEscaped) {
   EXPECT_EQ(list_text({"pc2:13776", "10.0.0.2:13776"}), "pc2:13776, 10.0.0.2:13776");
   EXPECT_EQ(list_text({"\x1b[2J"}), "\\x1b[2J");
   EXPECT_EQ(list_text({}), "");
+  EXPECT_EQ(list_text({"a", "b", "c"}, 3), "a, b, c");
+  EXPECT_EQ(list_text({"a", "b", "c"}, 1), "a, and 2 more");
 }
 
 TEST(Text, WritesSecondsExactlyOverTheWholeRange) {
