@@ -49,13 +49,27 @@ struct Clocks {
   std::int64_t wall_ns = 0, mono_ns = 0;
   std::int64_t raw_ns = 0;     // CLOCK_MONOTONIC_RAW: never slewed or set
   std::int64_t within_ns = 0;  // between reading raw before and after the others
-  std::int64_t instance = 0;   // differs between runs of this program
+  std::int64_t instance = 0;   // differs between runs of this program, and after a sleep of the PC
 };
 
-std::int64_t raw_now_ns() {
+std::int64_t now_ns(clockid_t clock) {
   timespec now{};
-  ::clock_gettime(CLOCK_MONOTONIC_RAW, &now);
+  ::clock_gettime(clock, &now);
   return std::int64_t{now.tv_sec} * 1'000'000'000 + now.tv_nsec;
+}
+
+std::int64_t raw_now_ns() { return now_ns(CLOCK_MONOTONIC_RAW); }
+
+// For how long the PC slept since its boot, at most. Its raw and its monotonic clock stand still
+// then.
+std::int64_t slept_ns() {
+  static std::atomic<std::int64_t> known = -1;
+  const std::int64_t before = now_ns(CLOCK_MONOTONIC), boot = now_ns(CLOCK_BOOTTIME);
+  const std::int64_t at_least = boot - now_ns(CLOCK_MONOTONIC);
+  std::int64_t slept = known;
+  while (at_least > slept && !known.compare_exchange_weak(slept, boot - before)) {
+  }
+  return known;
 }
 
 // An interrupted reading is inaccurate, so it is repeated.
@@ -63,7 +77,7 @@ constexpr std::int64_t kQuickEnoughNs = 40'000;
 constexpr int kMaxReadings = 5;
 
 Clocks read_clocks() {
-  static const std::int64_t instance = to_ns(WallClock::now());
+  static const std::int64_t start = to_ns(WallClock::now());
   Clocks best;
   for (int i = 0; i < kMaxReadings; ++i) {
     const std::int64_t before = raw_now_ns();
@@ -71,7 +85,7 @@ Clocks read_clocks() {
     const std::int64_t mono = MonoClock::now().time_since_epoch().count();
     const std::int64_t within = raw_now_ns() - before;
     if (i == 0 || within < best.within_ns)
-      best = {wall, mono, before + within / 2, within, instance};
+      best = {wall, mono, before + within / 2, within, start + slept_ns()};
     if (within < kQuickEnoughNs) break;
   }
   return best;

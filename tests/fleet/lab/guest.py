@@ -133,6 +133,14 @@ class Guest:
         """Continues a frozen PC."""
         self._signal(signal.SIGCONT)
 
+    def sleep(self, times: int) -> int:
+        """Suspends the PC so often: its oscillator stands still, and its wall clock is right afterwards. A User
+        Mode Linux kernel wakes up at the first interrupt, mostly within 2 ms. Returns how often it slept."""
+        done = "cat /sys/power/suspend_stats/success"
+        before = int(self.ssh.run(done))
+        self.ssh.run(f"for i in $(seq {times}); do echo mem > /sys/power/state; done")
+        return int(self.ssh.run(done)) - before
+
     def console_tail(self) -> str:
         """The end of its kernel's output."""
         return self.console.read_bytes()[-3000:].decode(errors="replace")

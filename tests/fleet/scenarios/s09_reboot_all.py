@@ -12,6 +12,7 @@ from lab.lab import Lab, await_that
 from lab.load import Load
 
 UNIT = "fleet-sensor"
+HEALTHY_SECONDS = 20  # the promise; 15.6 s were measured
 
 
 def run(lab: Lab) -> None:
@@ -22,8 +23,9 @@ def run(lab: Lab) -> None:
         lab.on_all(lambda guest: guest.reboot(lab.all_cores))
         on = time.monotonic()
         lab.on_all(await_healthy)
-        print(f"  | doctor finds no error on any PC {time.monotonic() - on:.1f} s after the last one was switched on",
-              flush=True)
+        took = time.monotonic() - on
+        print(f"  | doctor finds no error on any PC {took:.1f} s after the last one was switched on", flush=True)
+        assert took < HEALTHY_SECONDS, f"that is more than {HEALTHY_SECONDS} s"
         lab.on_all(Guest.await_running)
     lab.await_streams(*names)
     reader = Load(lab["pc3"], "read", names, rate_hz=100).await_ready()

@@ -32,6 +32,7 @@ SMALL_STEPS_NS = (5_000, 100_000, 1_000_000, 3_000_000, 50_000_000, 400_000_000)
 # Undone after a moment: chronyd would slew for minutes or hours.
 LARGE_STEPS_NS = (SECOND, 60 * SECOND, HOUR)
 SETTLED_NS = 1_000_000  # a clock that is still being slewed is stated to be further off
+SLEEPS = 20  # a guest wakes up at once
 DELAYS = ("1ms", "5ms", "20ms 10ms")
 
 Fault = tuple[str, Callable[[Lab, Truth], None], bool]  # name, what happens, whether the others stay good
@@ -112,6 +113,7 @@ def faults_of(guest: Guest, order: random.Random) -> Iterator[Fault]:
         yield f"sends {delay} later", delayed(guest, delay), not is_reference
     yield "overloaded", overloaded(guest), True
     yield "frozen", frozen(guest), True
+    yield "asleep", asleep(guest), True
     yield "power lost", power_lost(guest), True
     if is_reference:
         yield "returns with a wrong time", returns_with_wrong_time(guest), False
@@ -233,6 +235,15 @@ def frozen(guest: Guest) -> Callable[[Lab, Truth], None]:
         guest.freeze()
         time.sleep(5)
         guest.thaw()
+
+    return happen
+
+
+def asleep(guest: Guest) -> Callable[[Lab, Truth], None]:
+    """The PC sleeps, some 30 ms in all."""
+    def happen(_lab: Lab, _truth: Truth) -> None:
+        slept = guest.sleep(SLEEPS)
+        assert slept == SLEEPS, f"{guest.name} slept {slept} times, not {SLEEPS}"
 
     return happen
 
