@@ -9,8 +9,11 @@
 
 #include <algorithm>
 #include <cstring>
+#include <filesystem>
+#include <fstream>
 #include <optional>
 #include <span>
+#include <sstream>
 #include <string>
 #include <string_view>
 #include <utility>
@@ -30,6 +33,18 @@ inline Bytes to_bytes(std::string_view text) {
 }
 inline Bytes to_bytes(const net::Frame& frame) { return to_bytes(wire::encode_frame(frame)); }
 inline Bytes payload_of(const net::Frame& frame) { return to_bytes(frame.payload()); }
+
+// The bytes of a file of tests/golden: hexadecimal, with comments behind '#'.
+inline std::string golden_bytes(const std::filesystem::path& file) {
+  std::ifstream in(file);
+  EXPECT_TRUE(in) << file;
+  std::string bytes, word;
+  for (std::string line; std::getline(in, line);) {
+    std::istringstream words(line.substr(0, line.find('#')));
+    while (words >> word) bytes += static_cast<char>(std::stoi(word, nullptr, 16));
+  }
+  return bytes;
+}
 
 // What a dssmd or program of host `host` says of itself.
 inline wire::Greeting greeting_of(const std::string& host, const std::string& program = "dssmd") {

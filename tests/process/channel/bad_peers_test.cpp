@@ -11,6 +11,9 @@
 #include <algorithm>
 #include <array>
 #include <atomic>
+#include <cstdio>
+#include <cstdlib>
+#include <filesystem>
 #include <random>
 #include <thread>
 
@@ -71,38 +74,75 @@ TEST_F(BadPeer, ThatSendsRandomBytesCostsOnlyItself) {
   }
 }
 
-TEST_F(BadPeer, ThatChangesBytesOfGoodFramesCostsOnlyItself) {
-  const auto seed = std::random_device()();
-  SCOPED_TRACE("seed " + std::to_string(seed));
-  std::mt19937 random(seed);
-  net::Frame property;
-  property.mutable_set_property()->set_property("p");
-  std::string good;
-  std::uint64_t serial = 0;
-  for (const net::Frame& frame :
-       {create_frame("x", 16, 8), subscribe_from_oldest_frame(), read_newest_frame(),
-        start_publishing_frame(4), property, read_newest_frame()}) {
-    good += wire::encode_frame(with_serial(++serial, frame));
+// One of each frame of the protocol; all are about the stream "lidar".
+std::vector<std::string> all_frames() {
+  std::vector<std::string> frames;
+  for (const auto& entry : std::filesystem::directory_iterator(source("tests/golden/network"))) {
+    if (entry.path().extension() == ".hex") frames.push_back(golden_bytes(entry.path()));
   }
-  for (int round = 0; round < 300; ++round) {
-    NetworkPeer peer = NetworkPeer::greeted(daemon_.address());
-    std::string bytes = good;
-    for (int change = 0; change < 3; ++change) {
-      bytes[random() % bytes.size()] = static_cast<char>(random());
+  std::ranges::sort(frames);  // so that a seed means the same on each machine
+  return frames;
+}
+
+// Some of the frames, in any order, with some other bytes in them.
+std::string changed(const std::vector<std::string>& frames, std::mt19937& random) {
+  std::string bytes;
+  for (std::size_t left = 1 + random() % 12; left > 0; --left) {
+    std::string frame = frames[random() % frames.size()];
+    // Rarely in the length in front, after which nothing is understood any more.
+    for (std::size_t changes = random() % 3; changes > 0; --changes) {
+      frame[std::max<std::size_t>(random() % frame.size(), random() % 8 ? 1 : 0)] =
+          static_cast<char>(random());
     }
-    peer.send_bytes(bytes);
-    ::shutdown(peer.fd(), SHUT_WR);
-    while (::recv(peer.fd(), bytes.data(), bytes.size(), 0) > 0) {
+    bytes += frame;
+  }
+  if (random() % 4 == 0) bytes.resize(random() % bytes.size());
+  return bytes;
+}
+
+// $DSSM_FUZZ_SECONDS: for so long; $DSSM_TEST_SEED: as in an earlier run.
+TEST_F(BadPeer, ThatSendsAnyFramesInAnyOrderCostsOnlyItself) {
+  const char* const seconds = std::getenv("DSSM_FUZZ_SECONDS");
+  const char* const earlier = std::getenv("DSSM_TEST_SEED");
+  const auto seed = earlier ? static_cast<unsigned>(std::stoul(earlier)) : std::random_device()();
+  std::printf("DSSM_TEST_SEED=%u\n", seed);
+  std::mt19937 random(seed);
+  const std::vector<std::string> frames = all_frames();
+  ASSERT_GT(frames.size(), 40);
+  const MonoTime until = MonoClock::now() + std::chrono::seconds(seconds ? std::stoi(seconds) : 0);
+  int rounds = 0;
+  for (; rounds < 200 || MonoClock::now() < until; ++rounds) {
+    NetworkPeer writer = NetworkPeer::greeted(daemon_.address());
+    writer.create("lidar", 24, 16);
+    ASSERT_TRUE(writer.ask(start_publishing_frame(1)).has_publishing());
+    NetworkPeer peer(daemon_.address());
+    ASSERT_TRUE(peer.is_open());
+    if (random() % 8) {
+      ASSERT_FALSE(peer.greet());
+    }
+    if (random() % 2) peer.send(with_serial(1, open_frame("lidar")));
+    peer.send_bytes(changed(frames, random));
+    for (Tid tid = 0; tid < 20; ++tid) writer.send_sample({.tid = tid}, Bytes(24));
+    if (random() % 4 == 0) {  // a reset instead of an end
+      const linger at_once{1, 0};
+      ::setsockopt(peer.fd(), SOL_SOCKET, SO_LINGER, &at_once, sizeof at_once);
+    } else {
+      ::shutdown(peer.fd(), SHUT_WR);
+      std::array<char, 4096> answers{};
+      while (::recv(peer.fd(), answers.data(), answers.size(), 0) > 0) {
+      }
     }
     peer.close();
     // What it created has other names each time, and would take descriptors.
     const net::Frame list = good_.ask(list_frame());
+    ASSERT_TRUE(list.has_stream_list());
     for (const proto::Stream& stream : list.stream_list().streams()) {
       net::Frame remove;
       *remove.mutable_remove()->mutable_id() = stream.id();
       good_.ask(remove);
     }
   }
+  std::printf("%d peers\n", rounds);
 }
 
 TEST_F(BadPeer, OfALaterVersionIsRefusedNamingBothVersionsAndHosts) {

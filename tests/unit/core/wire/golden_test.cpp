@@ -10,10 +10,10 @@
 #include <functional>
 #include <map>
 #include <set>
-#include <sstream>
 
 #include "core/wire/frame.hpp"
 #include "core/wire/network_protocol.hpp"
+#include "tests/support/frames.hpp"
 #include "tests/unit/core/wire/recorder.hpp"
 
 namespace dssm::wire {
@@ -39,13 +39,7 @@ std::string text_of(const std::filesystem::path& file) {
 
 // The bytes of a golden file.
 std::string golden(const std::string& name) {
-  std::istringstream in(text_of(folder() / (name + ".hex")));
-  std::string bytes, word;
-  for (std::string line; std::getline(in, line);) {
-    std::istringstream words(line.substr(0, line.find('#')));
-    while (words >> word) bytes += static_cast<char>(std::stoi(word, nullptr, 16));
-  }
-  return bytes;
+  return test::golden_bytes(folder() / (name + ".hex"));
 }
 
 void set_id(proto::StreamId& id, const char* host, int number = 0) {
