@@ -9,14 +9,15 @@ import subprocess
 from lab.image import Image
 
 
-# ServerAlive ends a connection to a guest that lost its power.
+# ConnectTimeout includes the greeting of a guest that is still booting, on a busy machine. ServerAlive ends
+# a connection to a guest that lost its power.
 CONFIG = """\
 Host *
   User root
   IdentityFile {key}
   UserKnownHostsFile {known_hosts}
   BatchMode yes
-  ConnectTimeout 2
+  ConnectTimeout 15
   LogLevel ERROR
   ControlMaster auto
   ControlPersist yes
