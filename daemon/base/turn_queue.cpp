@@ -15,16 +15,19 @@ bool TurnQueue::Turn::may_begin() {
   return false;
 }
 
-void TurnQueue::Turn::wait() {
-  if (std::exchange(is_waiting_, true)) return;
+void TurnQueue::Turn::wait(Reason reason) {
+  if (is_waiting_ && reason >= reason_) return;
+  stop();
+  is_waiting_ = true;
+  reason_ = reason;
   used_ = std::max(used_, queue_.least_);
-  place_ = queue_.waiting_[account_].emplace(used_, this);
+  place_ = queue_.waiting_[{account_, reason_}].emplace(used_, this);
   queue_.next_.enable_in(Duration::zero());
 }
 
 void TurnQueue::Turn::stop() noexcept {
   if (!std::exchange(is_waiting_, false)) return;
-  const auto of_account = queue_.waiting_.find(account_);
+  const auto of_account = queue_.waiting_.find({account_, reason_});
   of_account->second.erase(place_);
   if (of_account->second.empty()) queue_.waiting_.erase(of_account);
 }
@@ -35,17 +38,24 @@ void TurnQueue::run() {
     auto of_account = waiting_.upper_bound(last_);
     if (of_account == waiting_.end()) of_account = waiting_.begin();
     last_ = of_account->first;
-    Turn& turn = *of_account->second.begin()->second;
-    turn.stop();
-    least_ = std::max(least_, turn.used_);
-    turn.is_called_ = true;
-    const Duration before = used_;
-    turn.take_();
-    turn.used_ += used_ - before;
-    turn.is_called_ = false;
-    if (turn.is_waiting_) turn.stop(), turn.wait();  // now by what it has used
+    const MonoTime begin = MonoClock::now();
+    do {
+      call(*of_account->second.begin()->second);
+      of_account = waiting_.find(last_);
+    } while (of_account != waiting_.end() && MonoClock::now() - begin < kMaxVisit);
   }
   if (!waiting_.empty()) next_.enable_in(Duration::zero());
+}
+
+void TurnQueue::call(Turn& turn) {
+  turn.stop();
+  least_ = std::max(least_, turn.used_);
+  turn.is_called_ = true;
+  const Duration before = used_;
+  turn.take_();
+  turn.used_ += used_ - before;
+  turn.is_called_ = false;
+  if (turn.is_waiting_) turn.stop(), turn.wait(turn.reason_);  // now by what it has used
 }
 
 }  // namespace dssm::daemon

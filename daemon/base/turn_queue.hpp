@@ -7,6 +7,7 @@
 #include <functional>
 #include <map>
 #include <string>
+#include <utility>
 
 #include "daemon/base/event_loop.hpp"
 
@@ -14,13 +15,18 @@ namespace dssm::daemon {
 
 // The clients of one server. In each turn of the loop they work for kMaxTurn together, and as long
 // as the last piece of work takes. Those that have to wait are called later: one account after
-// another, and of each account the client that has used the least time in such calls. So a program
-// that asks for little does not wait for hundreds that always have more to do.
+// another, for kMaxVisit each, and of an account the client that has used the least time in such
+// calls. So a program that asks for little does not wait for hundreds that always have more to do.
+// What clients asked for and what they get unasked take turns, too, as if these were of two
+// accounts: an answer does not wait until hundreds of programs got the news.
 //
 //   threads  one
 class TurnQueue {
  public:
   static constexpr Duration kMaxTurn = std::chrono::milliseconds(1);
+  static constexpr Duration kMaxVisit = kMaxTurn / 2;
+
+  enum class Reason { request, news };
 
   class Turn;
   using Waiting = std::multimap<Duration, Turn*>;  // of one account, by what they have used
@@ -38,7 +44,9 @@ class TurnQueue {
 
     // Whether the client may work now. If not, it waits.
     bool may_begin();
-    void wait();           // no effect if it waits already
+    // Of a client that waits already, news become a request, and not the other way round.
+    void wait(Reason reason = Reason::request);
+    bool is_waiting() const noexcept { return is_waiting_; }
     void stop() noexcept;  // it does not wait any more
 
    private:
@@ -46,6 +54,7 @@ class TurnQueue {
     TurnQueue& queue_;
     const std::string account_;
     const std::function<void()> take_;
+    Reason reason_{};  // of its last wait
     bool is_waiting_ = false, is_called_ = false;
     Duration used_{};            // of the loop's time, when it was called; at least `least_`
     Waiting::iterator place_{};  // while it waits
@@ -68,14 +77,17 @@ class TurnQueue {
 
  private:
   void run();
+  void call(Turn& turn);
 
-  std::map<std::string, Waiting> waiting_;  // by account; none is empty
+  using Account = std::pair<std::string, Reason>;
+
+  std::map<Account, Waiting> waiting_;  // none is empty
   // The greatest `used_` of a client that was called. A client that begins to wait gets at least
   // this: otherwise a new one, or one that was idle, would be called again and again until it has
   // used as much as the others.
   Duration least_{};
-  std::string last_;  // account that was called
-  Duration used_{};   // since run(), or of several turns of the loop in which nobody had to wait
+  Account last_;     // that was called
+  Duration used_{};  // since run(), or of several turns of the loop in which nobody had to wait
   EventSource next_;
 };
 

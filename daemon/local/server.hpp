@@ -130,7 +130,7 @@ class Connection final : public ClientOutput {
   ~Connection();
 
   void send(std::string bytes, std::vector<UniqueFd> descriptors) override;
-  void request_turn() override { turn_.wait(); }
+  void request_turn() override { turn_.wait(TurnQueue::Reason::news); }
 
  private:
   struct Outgoing {

@@ -3,6 +3,7 @@
 
 #include <gtest/gtest.h>
 
+#include <list>
 #include <string>
 
 #include "tests/unit/daemon/run_loop.hpp"
@@ -71,6 +72,30 @@ TEST_F(TurnQueueTest, ServesFirstWhoHasUsedLeast) {
     run_turns(loop, 1);
   }
   EXPECT_TRUE(was_called('1') && was_called('2') && was_called('3')) << called;
+}
+
+TEST_F(TurnQueueTest, ServesRequestsAndNewsInTurns) {
+  Client a1(*this, "a", "1"), a2(*this, "a", "2"), a3(*this, "a", "3"), asks(*this, "a", "?");
+  for (Client* one : {&a1, &a2, &a3, &asks}) one->turn.wait(TurnQueue::Reason::news);
+  asks.turn.wait();
+  asks.turn.wait(TurnQueue::Reason::news);  // still a request
+  run_turns(loop, 2);
+  EXPECT_EQ(called, "?1");
+}
+
+TEST_F(TurnQueueTest, ServesManyQuickClientsOfAnAccountInOneVisit) {
+  // Again, because the machine may keep this process from working for longer than a visit.
+  for (int attempt = 0; attempt < 1000 && called != "qqqb"; ++attempt) {
+    std::list<TurnQueue::Turn> quick;
+    for (int i = 0; i < 3; ++i) {
+      quick.emplace_back(queue, "a", [this] { called += 'q'; }).wait();
+    }
+    Client b(*this, "b", "b");
+    b.turn.wait();
+    called.clear();
+    run_turns(loop, 1);
+  }
+  EXPECT_EQ(called, "qqqb");
 }
 
 TEST_F(TurnQueueTest, ForgetsAClientThatHasStoppedOrIsGone) {
