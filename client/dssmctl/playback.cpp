@@ -20,6 +20,23 @@ double seconds_of(const Moment& moment) {
   return static_cast<double>(to_ns(time)) / 1e9;
 }
 
+bool changes(const PlaybackOptions& options) {
+  return options.reset || options.paused || options.speed || options.offset_s || options.time;
+}
+
+// Fails on a host whose clock follows another one: the next renewal would undo the change.
+Result<void> check_is_own(Session& session) {
+  const DaemonInfo daemon = DSSM_TRY(session.daemon_info());
+  const std::string& driver = daemon.playback_driver;
+  if (driver.empty()) return {};
+  const std::string host = driver.substr(driver.rfind('@') + 1);
+  return Error{Errc::conflict,
+               fmt::format("change the playback clock of '{}': it follows '{}', which would "
+                           "undo the change within a second; use `dssmctl playback` on '{}', or "
+                           "end that program",
+                           escaped(daemon.host), escaped(driver), escaped(host))};
+}
+
 void change(PlaybackClock& clock, const PlaybackOptions& options) {
   if (options.reset) clock.reset();
   if (options.paused) clock.set_paused(*options.paused);
@@ -51,6 +68,7 @@ void print(const PlaybackClock& clock, const PlaybackOptions& options, Output& o
 Result<void> run(const PlaybackOptions& options, Output& out) {
   Session session = DSSM_TRY(connect(options));
   PlaybackClock clock = DSSM_TRY(session.open_playback_clock());
+  if (changes(options)) DSSM_TRY(check_is_own(session));
   change(clock, options);
   print(clock, options, out);
   return {};

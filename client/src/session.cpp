@@ -397,7 +397,8 @@ Result<DaemonInfo> Session::daemon_info() {
       std::move(credentials),
       std::move(limits),
       daemon.config_file(),
-      daemon.clock_policy()};
+      daemon.clock_policy(),
+      daemon.playback_driver()};
 }
 
 bool Session::is_connected() const noexcept { return client_->connection().is_up(); }

@@ -121,7 +121,7 @@ Result<Reply> LocalRequests::serve_untrusted(const Client& client, const local::
     case local::Request::kListRights:
       return list_rights(client, DSSM_TRY(wire::stream_id_untrusted(request.list_rights().id())));
     case local::Request::kGetDaemon:
-      return get_daemon();
+      return get_daemon(client);
     case local::Request::kListHosts:
       if (fleet_) return list_hosts();
       break;
@@ -232,7 +232,7 @@ Reply LocalRequests::list_hosts() const {
   return reply;
 }
 
-Reply LocalRequests::get_daemon() const {
+Reply LocalRequests::get_daemon(const Client& client) const {
   Reply reply;
   local::Daemon& daemon = *reply.response.mutable_daemon();
   daemon.set_host(registry_.host());
@@ -244,6 +244,9 @@ Reply LocalRequests::get_daemon() const {
   const DaemonFacts facts = facts_ ? facts_() : DaemonFacts();
   daemon.set_config_file(facts.config_file);
   daemon.set_clock_policy(std::string(name_of(facts.clock_policy)));
+  if (rights_.check(*client, Action::open_clock, {})) {
+    daemon.set_playback_driver(clock_.followed_driver(MonoClock::now()));
+  }
   for (const LimitUse& one : facts.limits) {
     local::LimitUse& entry = *daemon.add_limits();
     entry.set_name(std::string(one.name));

@@ -170,7 +170,7 @@ class LocalRequests {
   Reply list_opens(const Client& client) const;
   Reply list_rights(const Client& client, const StreamId& id) const;
   Reply list_hosts() const;
-  Reply get_daemon() const;
+  Reply get_daemon(const Client& client) const;
 
   void create_elsewhere(const Client& client, const StreamId& id, const proto::Create& request,
                         Answer answer);

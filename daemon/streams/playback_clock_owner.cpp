@@ -98,6 +98,7 @@ Result<proto::FollowPlayback> PlaybackClockOwner::lead(const proto::FollowPlayba
                                                        std::string driver_name, MonoTime now) {
   clock::PlaybackRecord* const own = DSSM_TRY(record());
   DSSM_TRY(renew(request, driver_name, now));
+  follows_ = false;
   proto::FollowPlayback out;
   out.set_driver(request.driver());
   out.set_driver_name(std::move(driver_name));
@@ -114,11 +115,17 @@ Result<void> PlaybackClockOwner::follow_untrusted(const proto::FollowPlayback& r
   const clock::PlaybackSetting setting = DSSM_TRY(setting_untrusted(request.playback()));
   clock::PlaybackRecord* const own = DSSM_TRY(record());
   DSSM_TRY(renew(request, request.driver_name(), now));
+  follows_ = true;
   const bool is_set = own->try_update([&](const clock::PlaybackSetting&) {
     return request.ends() ? clock::PlaybackSetting{} : setting;
   });
   if (is_set) return {};
   return Error{Errc::unavailable, "a program of that host is changing its playback clock"};
+}
+
+std::string PlaybackClockOwner::followed_driver(MonoTime now) const {
+  // The name comes from another host, and may have been cut within a character.
+  return follows_ && driver_ != 0 && now < lease_end_ ? printable(driver_name_) : "";
 }
 
 MonoTime PlaybackClockOwner::check_lease(MonoTime now) noexcept {

@@ -48,6 +48,10 @@ class PlaybackClockOwner {
   //          program holds the clock's lock); no_memory
   Result<void> follow_untrusted(const proto::FollowPlayback& request, MonoTime now);
 
+  // The program of another host that drives this clock, for people: "dssmctl play@pc1". Empty: none
+  // does, or one of this PC.
+  std::string followed_driver(MonoTime now) const;
+
   // Called with each renewal; {}: no call. After kLease check_lease() is to be called.
   void on_lease(std::function<void()> then) { on_lease_ = std::move(then); }
   // Lets the clock show the real time again if the driver has not renewed it.
@@ -65,6 +69,7 @@ class PlaybackClockOwner {
   std::function<void()> on_lease_;
   std::uint64_t driver_ = 0;  // 0: none
   std::string driver_name_;
+  bool follows_ = false;  // the driver runs on another host
   MonoTime lease_end_{};
 };
 

@@ -114,6 +114,9 @@ struct DaemonInfo {
   std::vector<LimitInfo> limits;               // empty: an older dssmd
   std::string config_file;                     // empty: none, or an older dssmd
   std::string clock_policy;                    // the value of that key; empty: an older dssmd
+  // The program of another host that drives this PC's playback clock, "dssmctl play@pc1": it soon
+  // replaces what is set here. Empty: none, no right to use the clock, or an older dssmd.
+  std::string playback_driver;
 };
 
 // Who may do what with a stream on this PC, by dssmd's configuration (docs/security.md "Rights").

@@ -1265,6 +1265,29 @@ TEST_F(PlayFleet, OneDriverAtATime) {
   ASSERT_TRUE(session_.share_playback_clock(2));
 }
 
+TEST_F(PlayFleet, AClockThatFollowsIsNotChangedInVain) {
+  const auto set_there = [&] {
+    return run(argv({"playback", "set", "--speed", "3"}), {pc2_.environment()});
+  };
+  Finished finished;
+  await([&] {  // the lease may end before dssmctl has asked
+    EXPECT_TRUE(session_.share_playback_clock(1));
+    return (finished = set_there()).exit_status == 1;
+  });
+  EXPECT_EQ(
+      finished.err,
+      "dssmctl: playback set: change the playback clock of 'pc2': it follows 'the test@pc1', which "
+      "would undo the change within a second; use `dssmctl playback` on 'pc1', or end that "
+      "program\n");
+  EXPECT_EQ(there_.setting(), PlaybackClock::Setting{});
+  EXPECT_EQ(run(argv({"playback"}), {pc2_.environment()}).exit_status, 0) << "shows it";
+  output({"playback", "set", "--speed", "2"});  // on the driver's host
+  EXPECT_EQ(here_.setting().speed, 2);
+  EXPECT_TRUE(session_.share_playback_clock(1, true));
+  EXPECT_EQ(set_there().exit_status, 0);
+  EXPECT_EQ(there_.setting().speed, 3);
+}
+
 TEST_F(PlayFleet, FollowsAPlayerAndForgetsOneThatIsGone) {
   const std::string file = folder_.file("a.mcap");
   auto writer = RecordingWriter::create(file).value();

@@ -64,6 +64,22 @@ TEST_F(PlaybackLease, BelongsToOneDriver) {
   ASSERT_TRUE(owner_.follow_untrusted(request(3, 6), start_ + PlaybackClockOwner::kLease));
 }
 
+TEST_F(PlaybackLease, NamesTheDriverOfAnotherHostUntilItEnds) {
+  EXPECT_EQ(owner_.followed_driver(start_), "");
+  ASSERT_TRUE(owner_.lead(request(1, 0), "play@pc1", start_));
+  EXPECT_EQ(owner_.followed_driver(start_), "") << "a program of this PC";
+  const MonoTime end = start_ + PlaybackClockOwner::kLease;
+  proto::FollowPlayback follow = request(2, 3);
+  follow.set_driver_name("play\n@pc2");
+  ASSERT_TRUE(owner_.follow_untrusted(follow, end));
+  EXPECT_EQ(owner_.followed_driver(end), "play?@pc2");
+  // Late, but before check_lease().
+  EXPECT_EQ(owner_.followed_driver(end + PlaybackClockOwner::kLease), "");
+  follow.set_ends(true);
+  ASSERT_TRUE(owner_.follow_untrusted(follow, end));
+  EXPECT_EQ(owner_.followed_driver(end), "");
+}
+
 TEST_F(PlaybackLease, RefusesWhatIsNoClock) {
   EXPECT_EQ(owner_.follow_untrusted(request(0, 3), start_).error().code, Errc::invalid_argument);
   EXPECT_EQ(owner_.follow_untrusted(request(1, kNan), start_).error().code, Errc::invalid_argument);

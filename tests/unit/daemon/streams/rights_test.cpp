@@ -301,6 +301,19 @@ TEST_F(LocalRightsTest, ReadersOfWhatIsNotAllowedAnyMoreReopenIt) {
   EXPECT_EQ(opens.counts(*registry.find({"lidar", 0, ""}).value()).writers, 1u);
 }
 
+TEST_F(LocalRightsTest, WhoDrivesThePlaybackClockIsForThoseWhoMayUseIt) {
+  proto::FollowPlayback follow;
+  follow.set_driver(1);
+  follow.set_driver_name("play@pc2");
+  ASSERT_TRUE(clock.follow_untrusted(follow, MonoClock::now() + std::chrono::hours(1)));
+  local::Request request;
+  request.mutable_get_daemon();
+  set({"user:1000 read *"});
+  EXPECT_EQ(client.ask(request).daemon().playback_driver(), "");
+  set({"user:1000 clock *"});
+  EXPECT_EQ(client.ask(request).daemon().playback_driver(), "play@pc2");
+}
+
 TEST_F(LocalRightsTest, AStreamsRightsAreListed) {
   local::Request request;
   request.mutable_list_rights()->mutable_id()->set_name("lidar");
