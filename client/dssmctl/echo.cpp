@@ -5,6 +5,7 @@
 #include <fmt/format.h>
 
 #include <limits>
+#include <optional>
 
 #include "client/dssmctl/describe_stream.hpp"
 #include "client/dssmctl/fields.hpp"
@@ -23,22 +24,23 @@ SampleForm form_of(const EchoOptions& options) {
   return options.csv ? SampleForm::csv : SampleForm::text;
 }
 
-// The fields to show of the reader's stream as it is now: as it is described, else those of
-// `obvious`, the type that its programs have.
-Result<std::vector<Field>> wanted_fields(const RawReader& reader, const TypeInfo& obvious,
-                                         const EchoOptions& options) {
-  return DSSM_TRY(select_fields(readable_fields_untrusted(type_to_show(reader.type(), obvious)),
-                                options.fields),
-                  fmt::format("show '{}'", reader.id().str()));
+// The fields to show of the reader's stream, whose type is `own`: those, else those of `obvious`,
+// the type that its programs have.
+Result<std::vector<Field>> wanted_fields(const RawReader& reader, const TypeInfo& own,
+                                         const TypeInfo& obvious, const EchoOptions& options) {
+  return DSSM_TRY(
+      select_fields(readable_fields_untrusted(type_to_show(own, obvious)), options.fields),
+      fmt::format("show '{}'", reader.id().str()));
 }
 
 // Prints the samples after the reader's cursor, in order.
 class Echo {
  public:
   // obvious: as for wanted_fields()
-  Echo(RawReader& reader, TypeInfo obvious, SamplePrinter& printer, Output& out,
+  Echo(RawReader& reader, Follower& follower, TypeInfo obvious, SamplePrinter& printer, Output& out,
        const EchoOptions& options)
       : reader_(reader),
+        follower_(follower),
         obvious_(std::move(obvious)),
         printer_(printer),
         out_(out),
@@ -68,6 +70,7 @@ class Echo {
 
   // Prints what is there at this moment. Returns whether to continue.
   bool print_new() {
+    take_description();
     const Tid last = reader_.newest_tid();
     const std::uint64_t restarts = reader_.restarts();
     bool more = true;  // at least one read: only a read reports a restart
@@ -89,10 +92,13 @@ class Echo {
   void reopen() {
     out_.flush();  // so that the lines come in order where both outputs go to one place
     report_restart(reader_);
-    Result<std::vector<Field>> fields = wanted_fields(reader_, obvious_, options_);
+    const bool had_fields = !printer_.fields().empty();
+    Result<std::vector<Field>> fields = wanted_fields(reader_, type(), obvious_, options_);
     if (!fields) {
       result_ = std::move(fields).error();
-    } else if (*fields != printer_.fields()) {
+    } else if (!options_.csv && had_fields == fields->empty()) {
+      printer_.set_fields(*std::move(fields));  // it was described, or is not any more
+    } else if (had_fields && *fields != printer_.fields()) {
       result_ = Error{Errc::type_mismatch,
                       fmt::format("continue with '{}': it restarted with other fields; start again "
                                   "to see them",
@@ -100,7 +106,33 @@ class Echo {
     }
   }
 
+  // The stream may have been described since it was opened: `dssmctl describe`.
+  void take_description() {
+    std::optional<StreamInfo> stream = follower_.take_described();
+    if (!stream) return;
+    described_ = *std::move(stream);
+    if (described_.incarnation != reader_.incarnation()) return;  // reopen() comes to it
+    Result<std::vector<Field>> fields = wanted_fields(reader_, type(), obvious_, options_);
+    if (fields && *fields == printer_.fields()) return;
+    if (fields && !options_.csv) return printer_.set_fields(*std::move(fields));
+    out_.flush();
+    print_error(fmt::format(
+        "dssmctl: echo: '{}' was described, but its samples are shown as before, {}; "
+        "start again to see its fields\n",
+        escaped(reader_.id().str()),
+        fields ? "because CSV has one header" : "because they lack what --field names"));
+  }
+
+  // Of the ring that is being read, as it is described now.
+  const TypeInfo& type() const {
+    const TypeInfo& opened = reader_.type();
+    const bool is_newer = described_.incarnation == reader_.incarnation() &&
+                          described_.type.payload_bytes == opened.payload_bytes;
+    return is_newer ? described_.type : opened;
+  }
+
   RawReader& reader_;
+  Follower& follower_;
   const TypeInfo obvious_;
   SamplePrinter& printer_;
   Output& out_;
@@ -108,6 +140,7 @@ class Echo {
   std::uint64_t left_;
   std::uint64_t lost_ = 0;
   std::vector<std::byte> payload_;
+  StreamInfo described_;  // as it was announced with fields; first: nothing
   Result<void> result_;
 };
 
@@ -192,13 +225,13 @@ Result<void> run(const EchoOptions& options, Output& out) {
   OpenedStream& opened = all.front();
   RawReader& reader = opened.reader;
   TypeInfo obvious = obvious_type(opened.session, reader, "echo");
-  std::vector<Field> fields = DSSM_TRY(wanted_fields(reader, obvious, options));
+  std::vector<Field> fields = DSSM_TRY(wanted_fields(reader, reader.type(), obvious, options));
   // Before the first sample is shown: after it the next ones must come too, whatever happens to
   // dssmd.
   Follower follower = DSSM_TRY(Follower::open(opened.session, reader, out));
   SamplePrinter printer(out, {form_of(options), options.full, options.iso}, reader.id(),
                         std::move(fields));
-  Echo echo(reader, std::move(obvious), printer, out, options);
+  Echo echo(reader, follower, std::move(obvious), printer, out, options);
   printer.begin();
   DSSM_TRY(begin(options, opened.awaited, reader, echo));
   if (!echo.print_new()) return echo.result();

@@ -130,9 +130,13 @@ Result<Follower> Follower::open(Session& session, RawReader& reader, Output& out
   const bool own = reader.id().host == daemon.host;
   Follower follower(session, reader, out, own ? kStopCheckPeriod : kOfferTimeout);
   follower.watch_ = DSSM_TRY(
-      session.watch([suspicion = follower.suspicion_, id = reader.id()](const StreamEvent& event) {
+      session.watch([observed = follower.observed_, id = reader.id()](const StreamEvent& event) {
         if (event.stream.id != id) return;
-        suspicion->store(event.kind == StreamEvent::Kind::removed, std::memory_order_relaxed);
+        const bool is_removed = event.kind == StreamEvent::Kind::removed;
+        observed->removed.store(is_removed, std::memory_order_relaxed);
+        if (is_removed || event.stream.type.fields.empty()) return;
+        const std::lock_guard guard(observed->mutex);
+        observed->described = event.stream;
       }));
   return follower;
 }
@@ -143,7 +147,7 @@ Result<Follower> Follower::open(Session& session, RawReader& reader, Output& out
 // mirror knows.
 bool Follower::removed() {
   bool missing = false;
-  if (suspicion_->load(std::memory_order_relaxed) && session_.is_connected()) {
+  if (observed_->removed.load(std::memory_order_relaxed) && session_.is_connected()) {
     const Result<StreamInfo> now = session_.stream_info(reader_.id());
     missing = !now && now.error().code == Errc::not_found;
   }
@@ -153,6 +157,11 @@ bool Follower::removed() {
   }
   if (!missing_since_) missing_since_ = MonoClock::now();
   return MonoClock::now() - *missing_since_ >= removed_after_;
+}
+
+std::optional<StreamInfo> Follower::take_described() {
+  const std::lock_guard guard(observed_->mutex);
+  return std::exchange(observed_->described, std::nullopt);
 }
 
 Follower::Wake Follower::wait(MonoTime deadline) {

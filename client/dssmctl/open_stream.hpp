@@ -7,6 +7,8 @@
 #include <atomic>
 #include <dssm/session.hpp>
 #include <memory>
+#include <mutex>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -56,6 +58,10 @@ class Follower {
 
   Wake wait(MonoTime deadline);
 
+  // The stream as it was announced last, if its type has fields and this was not returned before.
+  // It is of the reader's ring if that has the same incarnation.
+  std::optional<StreamInfo> take_described();
+
  private:
   Follower(Session& session, RawReader& reader, Output& out, Duration removed_after)
       : session_(session), reader_(reader), out_(out), removed_after_(removed_after) {}
@@ -69,9 +75,13 @@ class Follower {
   RawReader& reader_;
   Output& out_;
   Duration removed_after_;  // how long the stream has to be missing to count as removed
-  // Set by the session's thread: whether a stream of this name was removed, and none came since.
-  // Shared with the callback, which moves with the watch.
-  std::shared_ptr<std::atomic<bool>> suspicion_ = std::make_shared<std::atomic<bool>>(false);
+  // Set by the session's thread. Shared with the callback, which moves with the watch.
+  struct Observed {
+    std::atomic<bool> removed = false;  // a stream of this name was, and none came since
+    std::mutex mutex;                   // of:
+    std::optional<StreamInfo> described;
+  };
+  std::shared_ptr<Observed> observed_ = std::make_shared<Observed>();
   std::optional<MonoTime> missing_since_;
   std::optional<Session::Watch> watch_;
 };

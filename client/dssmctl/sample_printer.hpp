@@ -11,6 +11,7 @@
 #include <dssm/stream.hpp>
 #include <span>
 #include <string>
+#include <utility>
 #include <vector>
 
 namespace dssm::ctl {
@@ -36,6 +37,8 @@ class SamplePrinter {
   void begin();
 
   const std::vector<Field>& fields() const { return fields_; }
+  // From the next sample on; not in CSV, whose header has been printed.
+  void set_fields(std::vector<Field> fields) { fields_ = std::move(fields); }
 
   // What came between a sample and those before it.
   struct Breaks {

@@ -202,6 +202,50 @@ TEST_F(Echo, DumpsBytesWhereNothingIsDescribed) {
   EXPECT_EQ(json({"echo", "raw:2", "--last"})["payload_hex"].get<std::string>().size(), 200U);
 }
 
+// A stream whose programs do not describe its type, and the type.
+class EchoDescribed : public CtlTest {
+ protected:
+  void write() { raw_.write(bytes_, at_ns(kSecond)); }
+  const TypeInfo type_ = type_of<Inner>();
+  const std::vector<std::byte> bytes_ = std::vector(sizeof(Inner), std::byte{1});
+  RawWriter raw_ =
+      session_.create_raw({"raw", 0, ""}, {"", sizeof(Inner), 1, {}}, depth_of(1024)).value();
+};
+
+TEST_F(EchoDescribed, ShowsFieldsOnceTheStreamIsDescribed) {
+  Running echo(argv({"echo", "raw", "--json"}), environment());
+  Json line = Json::parse(echo.line([&] { write(); }));
+  EXPECT_TRUE(line.contains("payload_hex")) << line;
+  ASSERT_TRUE(session_.describe(raw_.id(), type_));
+  while (!line.contains("fields")) line = Json::parse(echo.line([&] { write(); }));
+  EXPECT_EQ(line["fields"]["a"], 0x01010101);
+  EXPECT_FALSE(line.contains("payload_hex")) << line;
+  // Created again without them: it goes on with bytes. Stopped, it never finds the stream missing.
+  echo.stop();
+  ASSERT_TRUE(session_.remove(raw_.id()));
+  raw_ = session_.create_raw(raw_.id(), {"", sizeof(Inner), 1, {}}, depth_of(1024)).value();
+  echo.signal(SIGCONT);
+  std::string text;
+  do {
+    text = echo.line([&] { write(); });
+  } while (contains(text, "\"fields\""));
+  while (!contains(text, "payload_hex") && !text.empty()) text = echo.line([&] { write(); });
+  EXPECT_TRUE(contains(text, "\"restarts\":1")) << text;
+}
+
+TEST_F(EchoDescribed, KeepsTheColumnsOfCsv) {
+  Running echo(argv({"echo", "raw", "--csv"}), environment());
+  EXPECT_EQ(echo.line(), "tid,time_ns,clock_error_ns,payload_hex");
+  ASSERT_FALSE(echo.line([&] { write(); }).empty());
+  ASSERT_TRUE(session_.describe(raw_.id(), type_));
+  std::string text;
+  do {
+    text = echo.line([&] { write(); });
+  } while (!contains(text, "was described") && !text.empty());
+  EXPECT_TRUE(contains(text, "because CSV has one header; start again")) << text;
+  EXPECT_TRUE(contains(echo.line([&] { write(); }), ",0101010101010101"));
+}
+
 TEST_F(Echo, NamesTheFieldsThereAreWhenOneIsUnknown) {
   const Finished finished = ctl({"echo", "s", "--field", "nmber"});
   EXPECT_EQ(finished.exit_status, 2);
