@@ -299,8 +299,9 @@ class PConnector {
   bool mHasDataCon;
   struct dssm_ssm_remote* mRemote = nullptr;
 
+  // Samples of size 0 have an address, too.
   bool hasBuffer(const char* function) const {
-    if (mDataSize > 0) return true;
+    if (mData || mDataSize > 0) return true;
     std::cerr << "PConnector::" << function << "() : data buffer of '" << mName
               << "', id = " << streamId << " is not set" << std::endl;
     return false;

@@ -116,6 +116,10 @@ std::string RemoteStream::quoted_name() const {
   return quoted(connector_->id().name, connector_->id().id);
 }
 
+std::size_t RemoteStream::data_bytes() const noexcept {
+  return ssm::data_bytes(connector_->type());
+}
+
 void RemoteStream::report_once(const Error& error) {
   if (error.message == reported_) return remember_error(error.message);
   reported_ = error.message;
@@ -160,19 +164,21 @@ bool RemoteStream::create(const std::string& address, const StreamId& id, const 
               "create " + quoted(id.name, id.id));
 }
 
-bool RemoteStream::open(const std::string& address, const StreamId& id, std::size_t data_bytes) {
+bool RemoteStream::open(const std::string& address, const StreamId& id, std::size_t wanted_bytes) {
   const Call call(*this);
   if (!call) return false;
   open_.store(false);
   address_ = address;
   const std::string what = "open " + quoted(id.name, id.id);
   auto opened = retry(what, [&]() -> Result<PConnector> {
-    auto connector = PConnector::open(id, options(address, data_bytes));
-    if (!connector || connector->payload_bytes() == data_bytes) return connector;
+    auto connector = PConnector::open(id, options(address, wanted_bytes));
+    if (!connector) return connector;
+    const std::uint64_t bytes = ssm::data_bytes(connector->type());
+    if (bytes == wanted_bytes) return connector;
     return Error{Errc::type_mismatch,
                  fmt::format("the stream has {} bytes per sample, this program's type {} : use the "
                              "type that it was created with",
-                             connector->payload_bytes(), data_bytes)};
+                             bytes, wanted_bytes)};
   });
   return take(std::move(opened), what);
 }
@@ -295,17 +301,17 @@ SSM_tid RemoteStream::hand_over(ReadStatus status, const Request& request, const
                                 void* data, double* time) {
   if (status != ReadStatus::ok) return error_of(status, request.which);
   zero_rest(sample_, info);
-  std::memcpy(data, sample_.data(), sample_.size());
+  std::memcpy(data, sample_.data(), data_bytes());
   if (time) *time = seconds_from_time(info.time);
   return ssm_tid(info.tid);
 }
 
 // Whether the program's type is as long as the stream's; reports it if not.
 bool RemoteStream::has_size(const char* verb, std::size_t bytes) {
-  if (bytes == sample_.size()) return true;
+  if (bytes == data_bytes()) return true;
   report_once(
       {Errc::type_mismatch, fmt::format("{} {} : its samples have {} bytes, this program's type {}",
-                                        verb, quoted_name(), sample_.size(), bytes)});
+                                        verb, quoted_name(), data_bytes(), bytes)});
   return false;
 }
 
@@ -358,8 +364,10 @@ bool RemoteStream::write(const void* data, std::size_t bytes, double time) {
   const Call call(*this);
   if (!call.has_stream()) return false;
   if (!has_size("write", bytes)) return false;
-  const auto posted =
-      connector_->post({static_cast<const std::byte*>(data), bytes}, time_from_seconds(time));
+  static constexpr std::byte kNothing{};  // of a stream of size 0
+  const std::span<const std::byte> sample{
+      bytes > 0 ? static_cast<const std::byte*>(data) : &kNothing, sample_.size()};
+  const auto posted = connector_->post(sample, time_from_seconds(time));
   if (!posted) return report_once(posted.error()), false;
   if (connector_->is_connected()) {
     reported_.clear();
@@ -451,7 +459,7 @@ SSM_tid RemoteStream::top_buffered() {
 SSM_tid RemoteStream::read_buffered(const Request& request, void* data, std::size_t bytes,
                                     double* time) {
   const Call call(*this, Call::Way::memory);
-  if (!call.has_stream() || !collector_ || bytes != sample_.size()) return SSM_ERROR_NO_DATA;
+  if (!call.has_stream() || !collector_ || bytes != data_bytes()) return SSM_ERROR_NO_DATA;
   SampleInfo info;
   const ReadStatus status = read_from(*collector_, request, info, [](Tid, Tid) {});
   return hand_over(status, request, info, data, time);

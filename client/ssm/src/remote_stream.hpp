@@ -33,7 +33,7 @@ class RemoteStream {
   bool connect(const std::string& address);
   bool create(const std::string& address, const StreamId& id, const TypeInfo& type,
               const History& history);
-  bool open(const std::string& address, const StreamId& id, std::size_t data_bytes);
+  bool open(const std::string& address, const StreamId& id, std::size_t wanted_bytes);
   bool is_open() const noexcept { return open_.load(); }
   void close() noexcept { open_.store(false); }  // async-signal-safe: frees nothing yet
 
@@ -69,6 +69,7 @@ class RemoteStream {
   PConnectorOptions options(const std::string& address, std::uint64_t payload_bytes) const;
   bool take(Result<PConnector> opened, const std::string& what);
   std::string quoted_name() const;
+  std::size_t data_bytes() const noexcept;  // per sample, as the program sees it
   void report_once(const Error& error);
   void follow_restart();
 
@@ -89,7 +90,7 @@ class RemoteStream {
   std::atomic<bool> open_{false};
   std::optional<PConnector> connector_;
   std::string address_;
-  std::vector<std::byte> sample_;  // read into, before it is the program's
+  std::vector<std::byte> sample_;  // read into, before it is the program's; at least 1 byte
   Tid offset_ = 0, seen_ = kNoTid;
   std::uint64_t restarts_ = 0;  // of connector_, that offset_ includes
   std::string reported_;        // the last error, until a call succeeds

@@ -217,6 +217,41 @@ void carries_large_samples() {
   delete reader;
 }
 
+// Events: samples that have only a time.
+void carries_samples_of_size_0() {
+  double sent[1] = {0};  // room for the time, and nothing after it
+  char received = 'x';
+  PConnector writer("events", 0, address), reader("events", 0, address);
+  writer.setBuffer(&received, 0, 0, 0, sent);
+  reader.setBuffer(&received, 0, 0, 0, 0);
+  CHECK(writer.initRemote() && writer.create(1.0, 0.1) && writer.createDataCon());
+  CHECK(reader.initRemote() && reader.open() && reader.createDataCon());
+  if (!reader.isOpen()) return;
+  CHECK(!reader.readLast());
+  for (int i = 0; i < 3; ++i) {
+    CHECK(writer.write(1000.0 + i));
+    while (!reader.readNew()) usleep(1000);
+    CHECK_EQUAL(reader.timeId, i);
+    CHECK_SAME(reader.time, 1000.0 + i);
+  }
+  CHECK(reader.readTime(1001.5));
+  CHECK_EQUAL(reader.timeId, 1);
+  CHECK_EQUAL(received, 'x');
+
+  DSSMApi<char> other("events", 0, address);
+  catch_stderr();
+  CHECK(!other.open());
+  CHECK_TEXT(caught_stderr(), "has 0 bytes per sample, this program's type 1");
+
+  SSMApiBase local;
+  local.setBuffer(&received, 0, 0, 0);
+  CHECK(initSSM());
+  CHECK(local.open("events", 0));
+  CHECK(local.readLast());
+  CHECK_SAME(local.time, 1002);
+  CHECK(endSSM());
+}
+
 // The same stream, seen from this PC and over the network.
 void is_the_same_stream() {
   CHECK(initSSM());
@@ -297,6 +332,7 @@ int main(int argc, char** argv) {
   writes_and_reads();
   refuses_other_sizes();
   carries_large_samples();
+  carries_samples_of_size_0();
   is_the_same_stream();
   waits_can_be_limited();
   takes_other_types();
