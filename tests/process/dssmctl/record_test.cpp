@@ -331,6 +331,23 @@ TEST_F(Record, KeepsTheQuotaOfItsFolder) {
   EXPECT_EQ(Recording::open(folder_.path()).value().streams()[0].last_tid, 199);
 }
 
+TEST_F(Record, NamesWhatItDeletedAlsoWhenItCannotBegin) {
+  const std::string old = folder_.file("dssm_2026_11_10-12_00_00.mcap");
+  const std::string newer = folder_.file("dssm_2026_11_11-12_00_00.mcap");
+  for (const std::string& file : {old, newer}) std::ofstream(file) << std::string(70'000, 'x');
+  std::filesystem::last_write_time(old, std::filesystem::last_write_time(newer) - 1h);
+  std::vector<std::string> words = argv({"record", "--quota", "64KiB", "-o", folder_.path()});
+  // No file may have a byte, which is as a full disk is.
+  words.insert(words.begin(), {"env", "--ignore-signal=XFSZ", "prlimit", "--fsize=0"});
+  const Finished finished = run(words, environment());
+  EXPECT_EQ(finished.exit_status, 1);
+  EXPECT_TRUE(contains(finished.err, "File too large")) << finished.err;
+  EXPECT_TRUE(contains(finished.err, "'" + old + "' is deleted, because of --quota\n"))
+      << finished.err;
+  EXPECT_FALSE(std::filesystem::exists(old));
+  EXPECT_TRUE(std::filesystem::exists(newer));
+}
+
 TEST_F(Record, TakesAQuotaOnlyForAFolder) {
   const Finished refused = ctl({"record", "--quota", "1MiB", "-o", file_});
   EXPECT_EQ(refused.exit_status, 2);
@@ -759,6 +776,23 @@ TEST_F(Play, LeavesNoEmptyStreamsWhenItFails) {
   EXPECT_EQ(refused.exit_status, 1);
   EXPECT_TRUE(contains(refused.err, "'other")) << refused.err;
   EXPECT_EQ(own_streams(), std::vector<std::string>{"other"});
+}
+
+TEST_F(Play, LeavesNoEmptyStreamInPlaceOfOneThatItReplaced) {
+  make_recording_of_two_types();
+  output({"play", file_});
+  const StreamInfo before = session_.stream_info({"pose", 0, ""}).value();
+  const std::string failing = folder_.file("b.mcap");
+  auto writer = RecordingWriter::create(failing).value();
+  write_pose(writer, add_pose(writer), 0);
+  write_number(writer, {"pose", 0, "pc9"}, 1, 2);
+  write_number(writer, {"number", 0, "pc9"}, 2);
+  ASSERT_TRUE(writer.finish());
+  EXPECT_EQ(before.type.name, type_of<double>().name) << "of the recording's end";
+  const Finished failed = ctl({"play", failing, "--map", "number=number@pc9"});
+  EXPECT_EQ(failed.exit_status, 1);
+  EXPECT_TRUE(contains(failed.err, "pc9")) << failed.err;
+  EXPECT_EQ(own_streams(), std::vector<std::string>{});
 }
 
 TEST_F(Play, PlaysAStreamThatCameAgainWithAnotherType) {
