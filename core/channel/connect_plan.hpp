@@ -9,9 +9,9 @@
 //   pause   between rounds, from kFirstPause on, doubled each time, up to kMaxPause. It starts
 //           again with kFirstPause after a connection that was useful
 //   recent  for kRecentTime after a useful connection on a fast network, attempts and pauses are
-//           short, unless the other side accepts connections and ends them. What ended the useful
-//           one, as a cut cable or a restart, is usually soon over, and the kernel repeats a first
-//           packet that was lost only after 1 s
+//           short and first packets are repeated, unless the other side accepts connections and
+//           ends them. What ended the useful one, as a cut cable or a restart, is usually soon
+//           over, and the kernel repeats a first packet that was lost only after 1 s
 #pragma once
 
 #include <dssm/result.hpp>
@@ -36,6 +36,7 @@ class ConnectPlan {
   static constexpr Duration kRecentTime = std::chrono::minutes(1);
   static constexpr Duration kRecentPause = std::chrono::milliseconds(100);    // at most
   static constexpr Duration kRecentTimeout = std::chrono::milliseconds(200);  // for one address
+  static constexpr Duration kRepeat = std::chrono::milliseconds(20);          // of a first packet
   // On a fast network it takes at most so long to connect.
   static constexpr Duration kFastConnect = std::chrono::milliseconds(50);
   // Every so many rounds an attempt has kConnectTimeout: the network may have become slow.
@@ -54,7 +55,16 @@ class ConnectPlan {
   const wire::SocketAddress& address() const noexcept { return addresses_[current_]; }
   // How long it may take to connect to it.
   Duration connect_timeout() const noexcept;
-  // Why it failed when that time is over.
+  // After this time without an answer another first packet is sent, by an attempt beside those that
+  // wait already; then again.
+  std::optional<Duration> repeat_after() const noexcept {
+    return is_recent_ ? std::optional(kRepeat) : std::nullopt;
+  }
+  // connect_timeout() is over.
+  void on_no_answer() noexcept {
+    if (is_recent_) reset_pause();
+  }
+  // Why it failed then.
   std::string no_answer_text() const;
   // Connecting to address() failed. Whether there is a next one, which is address() now.
   bool next_address() noexcept;

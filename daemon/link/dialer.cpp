@@ -8,8 +8,10 @@
 #include <fmt/format.h>
 
 #include <algorithm>
+#include <iterator>
 #include <utility>
 
+#include "core/base/try.hpp"
 #include "core/wire/tcp.hpp"
 
 namespace dssm::daemon {
@@ -55,8 +57,7 @@ void Dialer::restart(const Error& why) {
     case State::secure:
       given_up_ = state_ == State::secure;
       lookup_.reset();
-      connected_.disable();
-      socket_.reset();
+      end_attempts();
       if (handshake_) handshake_->stop();
       reason_ = why;
       state_ = State::give_up;
@@ -98,8 +99,7 @@ bool Dialer::is_insecure() const noexcept {
 // Ends an attempt to connect and begins a new round. From the timer, because the caller may be in
 // the attempt's own callback.
 void Dialer::begin_round_soon() {
-  connected_.disable();
-  socket_.reset();
+  end_attempts();
   state_ = State::pause;
   timer_.enable_in(Duration::zero());
 }
@@ -137,44 +137,66 @@ void Dialer::try_addresses(std::vector<wire::SocketAddress> found) {
 }
 
 void Dialer::try_address() {
-  Result<UniqueFd> started = wire::start_connect(plan_.address());
-  if (!started) return try_next_address(started.error());
+  attempts_.clear();
+  if (Result<void> begun = begin_attempt(); !begun) return try_next_address(begun.error());
   state_ = State::connect;
   reached_ = Phase::connect;
-  attempt_began_ = loop_.now();
-  socket_ = *std::move(started);
-  connected_ = EventSource::writable(loop_, socket_.get(), [this] { on_connected(); });
-  connected_.enable();
-  timer_.enable_in(plan_.connect_timeout());
+  await_answer();
 }
 
 void Dialer::try_next_address(const Error& why) {
   plan_.next_address() ? try_address() : fail(why);
 }
 
-void Dialer::on_connected() {
-  connected_.disable();
-  if (Result<void> done = wire::finish_connect(socket_.get(), plan_.address()); !done) {
+Result<void> Dialer::begin_attempt() {
+  UniqueFd socket = DSSM_TRY(wire::start_connect(plan_.address()));
+  if (attempts_.size() == kMaxAttempts) attempts_.erase(std::next(attempts_.begin()));
+  Attempt& attempt = attempts_.emplace_back();
+  attempt.began = loop_.now();
+  attempt.connected =
+      EventSource::writable(loop_, socket.get(), [this, &attempt] { on_connected(attempt); });
+  attempt.socket = std::move(socket);
+  attempt.connected.enable();
+  return {};
+}
+
+// Without destroying them: the caller may be in the callback of one.
+void Dialer::end_attempts() {
+  for (Attempt& attempt : attempts_) {
+    attempt.connected.disable();
+    attempt.socket.reset();
+  }
+}
+
+void Dialer::await_answer() {
+  const Duration left = attempts_.front().began + plan_.connect_timeout() - loop_.now();
+  timer_.enable_in(std::min(left, plan_.repeat_after().value_or(left)));
+}
+
+void Dialer::on_connected(Attempt& attempt) {
+  Result<void> done = wire::finish_connect(attempt.socket.get(), plan_.address());
+  UniqueFd socket = std::move(attempt.socket);
+  end_attempts();
+  if (!done) {
     reason_ = std::move(done).error();
-    socket_.reset();
-    // From the timer, because `connected_` must not be replaced while its callback runs.
+    // From the timer, because an attempt must not be destroyed in its callback.
     return timer_.enable_in(Duration::zero());
   }
-  if (options_.retries_often) plan_.on_connected(loop_.now() - attempt_began_);
-  wire::set_channel_options(socket_.get());
+  if (options_.retries_often) plan_.on_connected(loop_.now() - attempt.began);
+  wire::set_channel_options(socket.get());
   reached_ = Phase::greet;
   if (const auto credentials = wire::credentials_of(options_.self)) {
     state_ = State::secure;
     timer_.disable();  // the handshake has its own
     handshake_ = std::make_unique<Handshake>(
-        loop_, credentials, std::move(socket_), ticket_,
+        loop_, credentials, std::move(socket), ticket_,
         [this](Result<std::unique_ptr<wire::Transport>> secured) {
           if (!secured) return fail(std::move(secured).error().context(peer_name()));
           greet(*std::move(secured));
         });
     return;
   }
-  greet(wire::make_transport(std::move(socket_), wire::TransportEnd::connected));
+  greet(wire::make_transport(std::move(socket), wire::TransportEnd::connected));
 }
 
 void Dialer::greet(std::unique_ptr<wire::Transport> transport) {
@@ -195,9 +217,15 @@ void Dialer::on_timer() {
     case State::give_up:
       return fail(*std::exchange(reason_, {}));
     case State::connect:
-      connected_.disable();
-      if (std::exchange(socket_, {})) reason_ = Error{Errc::unavailable, plan_.no_answer_text()};
-      return try_next_address(*std::exchange(reason_, {}));
+      if (reason_) return try_next_address(*std::exchange(reason_, {}));
+      if (loop_.now() - attempts_.front().began < plan_.connect_timeout()) {
+        // Where this fails at once, the attempts that wait find out, too.
+        static_cast<void>(begin_attempt());
+        return await_answer();
+      }
+      end_attempts();
+      plan_.on_no_answer();
+      return try_next_address({Errc::unavailable, plan_.no_answer_text()});
     case State::greet:
       reason_ = Error{Errc::unavailable, peer_name() + " does not greet; is it a dssmd?"};
       return connection_->close_with(*reason_);

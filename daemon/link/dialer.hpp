@@ -14,6 +14,7 @@
 #pragma once
 
 #include <cstdint>
+#include <list>
 #include <memory>
 #include <optional>
 #include <string>
@@ -95,7 +96,7 @@ class Dialer final : private FrameConnection::Observer {
  private:
   enum class State : std::uint8_t {
     look_up,  // until the resolver answers
-    connect,  // until the socket is connected, or the timer
+    connect,  // until a socket is connected, or the timer
     secure,   // until the TLS handshake ended
     greet,    // until their Hello came, or the timer
     up,       // until the connection closes
@@ -108,12 +109,26 @@ class Dialer final : private FrameConnection::Observer {
   void on_output_empty() override;
   void on_closed(const Error& why) override;
 
+  // To connect to one address.
+  struct Attempt {
+    UniqueFd socket;
+    MonoTime began;
+    EventSource connected;
+  };
+  // Beside each other: all repeats within ConnectPlan::kRecentTimeout, and the first one, which the
+  // kernel repeats when the network has become slow.
+  static constexpr std::size_t kMaxAttempts =
+      channel::ConnectPlan::kRecentTimeout / channel::ConnectPlan::kRepeat + 1;
+
   void begin_round();
   void begin_round_soon();
   void try_addresses(std::vector<wire::SocketAddress> found);
   void try_address();
   void try_next_address(const Error& why);
-  void on_connected();
+  Result<void> begin_attempt();
+  void end_attempts();
+  void await_answer();
+  void on_connected(Attempt& attempt);
   void greet(std::unique_ptr<wire::Transport> transport);
   void on_timer();
   Result<void> greet_untrusted(const net::Frame& frame);
@@ -128,9 +143,9 @@ class Dialer final : private FrameConnection::Observer {
   State state_ = State::pause;
   Phase reached_ = Phase::look_up;  // in this round, or in the last one
   channel::ConnectPlan plan_;
-  MonoTime round_began_{}, attempt_began_{};
+  MonoTime round_began_{};
   Resolver::Ticket lookup_;
-  UniqueFd socket_;  // while it connects
+  std::list<Attempt> attempts_;  // oldest first; kept until others begin
   wire::TlsTicket ticket_;
   // Until the next round, as the connection below.
   std::unique_ptr<Handshake> handshake_;
@@ -140,7 +155,7 @@ class Dialer final : private FrameConnection::Observer {
   std::optional<Error> reason_;  // why the connection is about to close, if known here
   bool given_up_ = false;        // by restart(), while it was up
   bool stopped_ = false;         // by stop()
-  EventSource connected_, timer_;
+  EventSource timer_;
 };
 
 }  // namespace dssm::daemon

@@ -118,10 +118,19 @@ TEST(ConnectPlan, TriesOftenOnlyWhereNobodyAnswers) {
   plan.end_round(MonoTime(200s), false);
   plan.begin_round(addresses(1));
   EXPECT_EQ(plan.connect_timeout(), ConnectPlan::kRecentTimeout);
+  EXPECT_EQ(plan.repeat_after(), ConnectPlan::kRepeat);
+  for (int round = 0; round < 10; ++round) {  // refused each time: nobody listens there
+    plan.begin_round(addresses(1));
+    plan.end_round(MonoTime(200s), false);
+  }
+  EXPECT_EQ(plan.end_round(MonoTime(200s), false), ConnectPlan::kRecentPause);
+  plan.on_no_answer();
+  EXPECT_EQ(plan.end_round(MonoTime(200s), false), ConnectPlan::kFirstPause);
   plan.on_up(MonoTime(200s));
   plan.end_round(MonoTime(200s + 1ms), false);  // it greets and then refuses
   plan.begin_round(addresses(1));
   EXPECT_EQ(plan.connect_timeout(), ConnectPlan::kConnectTimeout);
+  EXPECT_EQ(plan.repeat_after(), std::nullopt);
 }
 
 TEST(ConnectPlan, GivesASlowNetworkMoreTime) {
