@@ -77,17 +77,28 @@ bool Recorder::Opener::wants(const StreamInfo& stream) const {
 void Recorder::Opener::on_event(const StreamEvent& event) {
   const std::string name = event.stream.id.str();
   const std::lock_guard lock(mutex_);
+  // It has another type than its reader can continue with. That is opened at once, and not when the
+  // reader finds that out: until then the ring may be overwritten, or be removed, too.
+  std::optional<std::uint64_t> replaces;
   if (event.kind == StreamEvent::Kind::added && wants(event.stream)) {
     const auto known = known_.find(name);
     if (event.property_set) {
       want_property({event.stream, event.property_after, MonoClock::now()});
     } else if (known != known_.end() && !event.described && event.stream.property_bytes > 0) {
       // It was created again, or its host is there again. Its reader continues.
-      const bool is_new = known->second != event.stream.incarnation;
+      const bool is_new = known->second.incarnation != event.stream.incarnation;
       want_property(
           {event.stream, is_new ? std::optional(kNoTid) : std::nullopt, MonoClock::now()});
     }
-    if (known != known_.end()) known->second = event.stream.incarnation;
+    if (known != known_.end()) {
+      std::uint64_t& incarnation = known->second.incarnation;
+      if (incarnation != event.stream.incarnation &&
+          !event.stream.type.check_usable_as(known->second.type)) {
+        replaces = incarnation;
+      } else {
+        incarnation = event.stream.incarnation;
+      }
+    }
   }
   if (event.described) described_[name] = {event.stream.incarnation, event.stream.type};
   const auto is_it = [&](const Wanted& wanted) { return wanted.stream.id == event.stream.id; };
@@ -99,10 +110,14 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
         std::count_if(wanted_.begin(), wanted_.end(), [&](const Wanted& wanted) {
           return is_it(wanted) && wanted.from_start && !wanted.reported;
         }));
-    std::erase_if(wanted_, is_it);
+    std::erase_if(wanted_, [&](const Wanted& wanted) {
+      if (!is_it(wanted)) return false;
+      if (!wanted.reported && !wanted.is_opening) notice_missed(wanted.stream.id);
+      return true;
+    });
     return;
   }
-  if (!wants(event.stream) || known_.contains(name) ||
+  if (!wants(event.stream) || (known_.contains(name) && !replaces) ||
       std::any_of(wanted_.begin(), wanted_.end(), is_it)) {
     return;
   }
@@ -110,8 +125,20 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
   // One that fits since it was described was there, too.
   const bool was_there = is_beginning_ || event.described;
   untried_ += was_there;
-  wanted_.push_back({event.stream, MonoClock::now(), was_there, false});
+  if (replaces) notice_reopening(event.stream.id, "its samples are of another type now");
+  wanted_.push_back({event.stream, MonoClock::now(), was_there, false, replaces});
   changed_.notify_one();
+}
+
+void Recorder::Opener::notice_reopening(const StreamId& id, const std::string& reason) {
+  notices_.push_back(fmt::format("'{}' is opened again: {}", escaped(id.str()), reason));
+}
+
+void Recorder::Opener::notice_missed(const StreamId& id) {
+  notices_.push_back(
+      fmt::format("'{}' was removed, or its host lost, before it could be opened: samples that it "
+                  "had by then may be missing, and do not count as lost",
+                  escaped(id.str())));
 }
 
 void Recorder::Opener::want_property(SetProperty wanted) {
@@ -150,7 +177,8 @@ void Recorder::Opener::fetch_property(std::unique_lock<std::mutex>& lock,
 std::vector<Recorder::Opener::Wanted>::iterator Recorder::Opener::next_wanted() {
   auto next = wanted_.end();
   for (auto wanted = wanted_.begin(); wanted != wanted_.end(); ++wanted) {
-    if (stop_at_ && (!wanted->from_start || wanted->reported)) continue;
+    const bool is_recorded = wanted->from_start || wanted->replaces;
+    if (stop_at_ && (!is_recorded || wanted->reported)) continue;
     if (next == wanted_.end() || wanted->due < next->due) next = wanted;
   }
   return next;
@@ -168,16 +196,22 @@ std::vector<StreamId> Recorder::Opener::take_removed(Duration age) {
   return old;
 }
 
-void Recorder::Opener::reopen(const StreamId& id, const Error& error) {
+void Recorder::Opener::reopen(const RawReader& ended, const Error& error) {
   const std::lock_guard lock(mutex_);
-  notices_.push_back(fmt::format("'{}' is opened again: {}", escaped(id.str()),
-                                 error.code == Errc::type_mismatch
-                                     ? "its samples are of another type now"
-                                     : escaped_message(error.message)));
+  if (stop_at_) return;
+  const StreamId& id = ended.id();
+  const bool is_wanted =
+      std::ranges::any_of(wanted_, [&](const Wanted& wanted) { return wanted.stream.id == id; });
+  const bool is_opened =
+      std::ranges::any_of(opened_, [&](const Source& source) { return source.reader.id() == id; });
+  if (is_wanted || is_opened) return;
+  notice_reopening(id, error.code == Errc::type_mismatch ? "its samples are of another type now"
+                                                         : escaped_message(error.message));
   known_.erase(id.str());
   Wanted wanted;
   wanted.stream.id = id;
   wanted.due = MonoClock::now();
+  wanted.replaces = ended.incarnation();
   wanted_.push_back(std::move(wanted));
   changed_.notify_one();
 }
@@ -207,23 +241,39 @@ void Recorder::Opener::run() {
       fetch_property(lock, wanted_property);
       continue;
     }
+    next->is_opening = true;
     const Wanted wanted = *next;
     lock.unlock();
     Result<Source> opened = open(wanted);
     lock.lock();
     // It may have been removed meanwhile, and created again.
-    const auto entry = std::find_if(wanted_.begin(), wanted_.end(), [&](const Wanted& other) {
+    auto entry = std::find_if(wanted_.begin(), wanted_.end(), [&](const Wanted& other) {
       return other.stream.id == wanted.stream.id;
     });
+    const std::uint64_t incarnation = wanted.stream.incarnation;  // 0: not known
+    if (entry != wanted_.end() && entry->stream.incarnation != incarnation) {
+      const StreamInfo& next_one = entry->stream;
+      const bool is_taken = opened && (opened->reader.incarnation() == next_one.incarnation ||
+                                       next_one.type.check_usable_as(opened->reader.type()));
+      if (!is_taken) {  // that one has its turn
+        if (opened) entry->replaces = opened->reader.incarnation();
+        entry = wanted_.end();
+      }
+    }
     const bool is_wanted = entry != wanted_.end();
     if (is_wanted && entry->from_start && !entry->reported) --untried_;
-    if (opened) {  // the reader has the samples of its ring, and follows a new one
-      known_[wanted.stream.id.str()] = wanted.stream.incarnation;
+    const bool is_missed =
+        incarnation != 0 && (opened ? opened->reader.incarnation() != incarnation : !is_wanted);
+    if (is_missed && !wanted.reported) notice_missed(wanted.stream.id);
+    if (opened) {  // the reader has the samples of its ring, and follows a new one of its type
+      const RawReader& reader = opened->reader;
+      known_[wanted.stream.id.str()] = {reader.incarnation(), reader.type()};
       if (is_wanted) wanted_.erase(entry);
       opened_.push_back(*std::move(opened));
       continue;
     }
     if (!is_wanted) continue;
+    entry->is_opening = false;
     const Error& error = opened.error();
     const bool is_to_retry = is_retryable(error.code);
     if (!wanted.reported) {
@@ -272,6 +322,7 @@ Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
       source.until = plan_.range->last;
     }
     if (source.from) skip_to(source.reader, *source.from);
+    if (wanted.replaces && *wanted.replaces != source.reader.incarnation()) source.next = 0;
   }
   return source;
 }
@@ -371,7 +422,6 @@ Result<void> Recorder::take_until(Time held_from) {
     return {};
   }
   filled_ = 0;
-  check_readers();
   std::optional<Time> until;
   for (const Source& source : sources_) {
     const std::optional<Time> time = is_of_past(source) ? next_time(source) : std::nullopt;
@@ -380,7 +430,9 @@ Result<void> Recorder::take_until(Time held_from) {
   if (until) until = saturating_add(*until, kPastPart);
   is_more_ = false;
   DSSM_TRY(take_in_order(until, held_from));
-  for (Source& source : sources_) DSSM_TRY(write_properties(source, false));
+  end_sources();
+  for (Source& source : sources_) DSSM_TRY(write_properties(source, source.is_over));
+  drop_ended();
   next_take_ = is_more_ ? MonoClock::now() : deadline_in(next_period());
   return {};
 }
@@ -404,6 +456,8 @@ Duration Recorder::next_period() {
 
 Result<void> Recorder::add(Source source) {
   period_ = kMinPeriod;  // how quickly its ring fills is not known yet
+  // The reader of an earlier source may have gone there by itself.
+  if (is_double(source)) return {};
   Source& added = sources_.emplace_back(std::move(source));
   if (!is_recording_) return {};
   if (is_on_demand_) want_past(added);
@@ -422,9 +476,14 @@ Result<void> Recorder::add_to_file(Source& source) {
 }
 
 void Recorder::add_property(const StreamId& id, NewProperty property) {
-  const auto source =
-      std::ranges::find_if(sources_, [&](const Source& one) { return one.reader.id() == id; });
-  if (source == sources_.end()) return;
+  // The one with that ring, else the last one, which may have yet to follow to it.
+  Source* source = nullptr;
+  for (Source& one : sources_) {
+    if (one.reader.id() != id) continue;
+    source = &one;
+    if (one.reader.incarnation() == property.incarnation) break;
+  }
+  if (source == nullptr) return;
   if (!property.after) {
     const bool is_here = property.incarnation == source->reader.incarnation();
     property.after = is_here ? source->reader.newest_tid() : kNoTid;
@@ -494,10 +553,40 @@ void Recorder::follow_restart(Source& source) {
   const Tid cursor = reader.cursor();
   BorrowedSample newest;
   if (reader.borrow(reader.newest_tid(), newest) == ReadStatus::restarted) {
-    source.property.clear();  // dssmd reports the one that it has
+    on_restarted(source);
   } else {
     reader.seek(cursor);
   }
+}
+
+void Recorder::on_restarted(Source& source) {
+  source.property.clear();  // dssmd reports the one that it has
+  source.is_over = is_double(source);
+  if (source.is_over) source.new_properties.clear();  // the other one has them
+}
+
+bool Recorder::is_double(const Source& source) const {
+  return std::ranges::any_of(sources_, [&](const Source& other) {
+    return &other != &source && other.reader.id() == source.reader.id() &&
+           other.reader.incarnation() == source.reader.incarnation();
+  });
+}
+
+void Recorder::end_sources() {
+  for (Source& source : sources_) {
+    const std::optional<Error> error = source.reader.restart_error();
+    if (!error) continue;
+    source.is_over = true;
+    const bool is_followed = std::ranges::any_of(sources_, [&](const Source& other) {
+      return other.reader.id() == source.reader.id() && !other.is_over &&
+             !other.reader.restart_error();
+    });
+    if (!is_followed) opener_.reopen(source.reader, *error);
+  }
+}
+
+void Recorder::drop_ended() {
+  std::erase_if(sources_, [](const Source& source) { return source.is_over; });
 }
 
 // Those that all samples in the ring have are the past of it.
@@ -516,20 +605,15 @@ void Recorder::check_readers() {
   if (now < next_check_) return;
   next_check_ = now + kCheckPeriod;
   // Their rings would take memory for ever.
-  if (!is_recording_) {
-    for (const StreamId& removed : opener_.take_removed(keep_removed_)) {
-      std::erase_if(sources_, [&](const Source& one) { return one.reader.id() == removed; });
-    }
+  for (const StreamId& removed : opener_.take_removed(keep_removed_)) {
+    std::erase_if(sources_, [&](const Source& one) { return one.reader.id() == removed; });
   }
-  std::erase_if(sources_, [&](Source& source) {
-    if (!is_recording_) {
-      follow_restart(source);
-      forget_properties(source);
-    }
-    const std::optional<Error> error = source.reader.restart_error();
-    if (error) opener_.reopen(source.reader.id(), *error);
-    return error.has_value();
-  });
+  for (Source& source : sources_) {
+    follow_restart(source);
+    forget_properties(source);
+  }
+  end_sources();
+  drop_ended();
 }
 
 Result<void> Recorder::take_in_order(std::optional<Time> past_until, Time held_from) {
@@ -575,7 +659,8 @@ Result<bool> Recorder::take_next(Turn& turn) {
   SampleInfo info;
   const ReadStatus status = source.reader.read_next(payload_, info);
   if (status == ReadStatus::restarted) {
-    source.property.clear();  // dssmd reports the one that it has
+    on_restarted(source);
+    if (source.is_over) return false;
     DSSM_TRY(add_to_file(source));
     source.next = 0;
     source.past_until = kNoTid;

@@ -108,8 +108,7 @@ class Recorder {
   static constexpr Duration kOpeningTime = std::chrono::seconds(1);
   // Another host that sends nothing more is not waited for longer than that.
   static constexpr Duration kMaxPastWait = std::chrono::seconds(10);
-  static constexpr Duration kCheckPeriod =
-      std::chrono::seconds(1);  // for readers that cannot go on
+  static constexpr Duration kCheckPeriod = std::chrono::seconds(1);  // of readers, without a file
   // The past is recorded in parts of this length, each of all streams, so that the recording is
   // about in the order of times.
   static constexpr Duration kPastPart = std::chrono::milliseconds(100);
@@ -146,6 +145,8 @@ class Recorder {
     std::vector<std::byte> property;  // that the file has, or gets at its beginning
     std::vector<NewProperty> new_properties;  // the file has not yet
     bool has_fields = false;                  // in the file
+    // Its reader cannot continue, or another source has the ring that it would continue with.
+    bool is_over = false;
   };
   static Time past_of(const Source& source, Time now, Duration past);
 
@@ -159,13 +160,13 @@ class Recorder {
 
     // All that exists, then all that comes.
     Result<void> begin();
-    // Opens nothing more, but those that there were at begin(), for a second at most; waits for
-    // that.
+    // Opens nothing more, but those that there were at begin() or that have another type now, for a
+    // second at most; waits for that.
     void end();
     // Streams that were removed for so long; they are opened again if they come again.
     std::vector<StreamId> take_removed(Duration age);
-    // Opens it again: its reader cannot go on, because of `error`.
-    void reopen(const StreamId& id, const Error& error);
+    // Opens it again, unless that is being done: `ended` cannot continue, because of `error`.
+    void reopen(const RawReader& ended, const Error& error);
 
     std::vector<Source> take_opened();
     // To be called before take_opened(), which then has their streams.
@@ -181,6 +182,14 @@ class Recorder {
       MonoTime due{};
       bool from_start = false;  // it was there at begin()
       bool reported = false;
+      // The incarnation before, which was opened: all samples of this one are wanted.
+      std::optional<std::uint64_t> replaces = {};
+      bool is_opening = false;
+    };
+    // What was opened last of a name, and the incarnation that its reader continues with.
+    struct Known {
+      std::uint64_t incarnation = 0;
+      TypeInfo type;
     };
     // A property to be fetched, of a stream as the event describes it.
     struct SetProperty {
@@ -193,6 +202,8 @@ class Recorder {
     // The one to try next; the end: none.
     std::vector<Wanted>::iterator next_wanted();
     bool wants(const StreamInfo& stream) const;
+    void notice_reopening(const StreamId& id, const std::string& reason);
+    void notice_missed(const StreamId& id);
     void on_event(const StreamEvent& event);
     void run();
     Result<Source> open(const Wanted& wanted) const;
@@ -205,8 +216,7 @@ class Recorder {
     std::condition_variable changed_;
     bool is_beginning_ = true;  // begin() runs: what comes is there already
     std::vector<Wanted> wanted_;
-    // Names and incarnations of what was opened: they restart by themselves.
-    std::map<std::string, std::uint64_t> known_;
+    std::map<std::string, Known> known_;                  // by name
     std::vector<std::pair<StreamId, MonoTime>> removed_;  // of these, and when
     std::size_t untried_ = 0;
     std::vector<Source> opened_;
@@ -249,9 +259,16 @@ class Recorder {
   static bool is_of_past(const Source& source) { return source.next <= source.past_until; }
   // The time of the next sample; empty: there is none, or it is not here.
   static std::optional<Time> next_time(const Source& source);
-  // What cannot be read any more is opened again.
+  // While nothing is recorded: closes what was removed, and follows restarts.
   void check_readers();
-  static void follow_restart(Source& source);
+  void follow_restart(Source& source);
+  // To be called when the reader has gone to another ring.
+  void on_restarted(Source& source);
+  // Whether another source has the same ring.
+  bool is_double(const Source& source) const;
+  // Marks those whose readers cannot continue; their streams are opened again.
+  void end_sources();
+  void drop_ended();
   static void forget_properties(Source& source);
   void add_property(const StreamId& id, NewProperty property);
   // Those whose time is known.

@@ -225,6 +225,26 @@ TEST_F(Record, OpensAStreamAgainThatHasAnotherType) {
   EXPECT_EQ(recording.streams()[1].samples, 5U);
 }
 
+TEST_F(Record, SaysThatAStreamWasRemovedBeforeItWasOpened) {
+  auto pose = std::optional(session_.create<RecordedPose>("pose", depth_of(64)).value());
+  Running running(argv({"record", "-o", file_}), environment());
+  await_reader(pose->id());
+  running.stop();
+  ASSERT_TRUE(session_.remove(pose->id()));
+  pose.reset();
+  session_.create<double>("pose", depth_of(64)).value().write(1);
+  ASSERT_TRUE(session_.remove({"pose", 0, ""}));
+  const auto number = session_.create<float>("pose", depth_of(64)).value();
+  running.signal(SIGCONT);
+  const auto is_it = [](const std::string& line) {
+    return contains(line, "'pose:0@pc1' was removed, or its host lost, before it could be ");
+  };
+  std::string line = running.line();
+  while (!line.empty() && !is_it(line)) line = running.line();  // "is opened again"
+  running.signal(SIGINT);
+  EXPECT_EQ(running.status(), 0);
+}
+
 TEST_F(Record, OfThePastIsInTheOrderOfTimesOfAllStreams) {
   auto first = session_.create<RecordedPose>("first", depth_of(1024)).value();
   auto second = session_.create<RecordedPose>("second", depth_of(1024)).value();

@@ -1,0 +1,81 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What dssmctl record does while it reads no ring: here the test decides when it reads.
+#include "client/dssmctl/recorder.hpp"
+
+#include <dssm/recording.hpp>
+#include <optional>
+
+#include "tests/process/dssmctl/ctl_test.hpp"
+#include "tests/support/folder.hpp"
+
+namespace dssm::test {
+namespace {
+
+class RecorderOf : public CtlTest {
+ protected:
+  // Until it has the stream open. Nothing is taken then until the test does.
+  void start(const StreamId& id) {
+    recorder_ = ctl::Recorder::start(session_with(daemon_), RecordingWriter::create(file_).value(),
+                                     {ctl::StreamFilter({}, {}), {}, {}, {}, false})
+                    .value();
+    await_opened(id);
+    ASSERT_TRUE(recorder_->take());
+    ASSERT_EQ(recorder_->streams(), 1U);
+  }
+  void await_opened(const StreamId& id) {
+    await([&] { return session_.stream_info(id).value().readers == 1; });
+  }
+  // A stream named "again" that has `samples` samples, in place of the one before.
+  template <Payload T>
+  RawWriter replace(int samples, std::uint64_t depth = 64) {
+    (void)session_.remove({"again", 0, ""});
+    RawWriter writer = session_.create_raw({"again", 0, ""}, type_of<T>(), depth_of(depth)).value();
+    for (int i = 0; i < samples; ++i) {
+      const T value = static_cast<T>(i);
+      writer.write(std::as_bytes(std::span(&value, 1)));
+    }
+    return writer;
+  }
+
+  TestFolder folder_;
+  std::string file_ = folder_.file("a.mcap");
+  std::unique_ptr<ctl::Recorder> recorder_;
+};
+
+// The reader of the first one could continue with the last one, too.
+TEST_F(RecorderOf, AStreamHasAllTypesThatItHadInATurn) {
+  RawWriter writer = replace<double>(0);
+  start(writer.id());
+  writer = replace<float>(5);
+  await_opened(writer.id());
+  writer = replace<std::int64_t>(6);
+  await_opened(writer.id());
+  writer = replace<double>(7);
+  await_opened(writer.id());
+  ASSERT_TRUE(recorder_->finish());
+  EXPECT_EQ(recorder_->streams(), 1U);
+  EXPECT_EQ(recorder_->take_notices(),
+            std::vector<std::string>(3,
+                                     "'again:0@pc1' is opened again: its samples are of "
+                                     "another type now"));
+  const Recording recording = Recording::open(file_).value();
+  std::vector<std::uint64_t> samples;
+  for (const RecordedStreamInfo& stream : recording.streams()) samples.push_back(stream.samples);
+  EXPECT_EQ(samples, (std::vector<std::uint64_t>{0, 5, 6, 7}));
+  EXPECT_EQ(recorder_->progress().lost_samples, 0U);
+}
+
+TEST_F(RecorderOf, AStreamOfAnotherTypeLosesWhatItsRingOverwroteBeforeItWasOpened) {
+  RawWriter writer = replace<double>(0);
+  start(writer.id());
+  writer = replace<float>(1000, 8);
+  await_opened(writer.id());
+  ASSERT_TRUE(recorder_->finish());
+  const RecordingProgress progress = recorder_->progress();
+  EXPECT_GT(progress.samples, 0U);
+  EXPECT_EQ(progress.samples + progress.lost_samples, 1000U);
+}
+
+}  // namespace
+}  // namespace dssm::test
