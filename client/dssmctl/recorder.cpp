@@ -100,7 +100,10 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
       }
     }
   }
-  if (event.described) described_[name] = {event.stream.incarnation, event.stream.type};
+  if (event.described) {
+    described_[name] = {event.stream.incarnation, event.stream.type};
+    newly_described_.push_back(event.stream.id);
+  }
   const auto is_it = [&](const Wanted& wanted) { return wanted.stream.id == event.stream.id; };
   std::erase_if(removed_, [&](const auto& entry) { return entry.first == event.stream.id; });
   if (event.kind == StreamEvent::Kind::removed) {
@@ -345,6 +348,11 @@ std::optional<TypeInfo> Recorder::Opener::described(const StreamId& id,
   return found->second.second;
 }
 
+std::vector<StreamId> Recorder::Opener::take_described() {
+  const std::lock_guard lock(mutex_);
+  return std::exchange(newly_described_, {});
+}
+
 std::vector<std::string> Recorder::Opener::take_notices() {
   const std::lock_guard lock(mutex_);
   return std::exchange(notices_, {});
@@ -411,6 +419,7 @@ Result<void> Recorder::take_until(Time held_from) {
     if (Result<void> one = add(std::move(opened)); !one && added) added = std::move(one);
   }
   for (auto& [id, property] : properties) add_property(id, std::move(property));
+  const std::vector<StreamId> described = opener_.take_described();
   DSSM_TRY(std::move(added));
   if (!is_recording_) {
     check_readers();
@@ -421,6 +430,7 @@ Result<void> Recorder::take_until(Time held_from) {
     next_take_ = deadline_in(kMinPeriod);
     return {};
   }
+  for (const StreamId& id : described) DSSM_TRY(describe(id));
   filled_ = 0;
   std::optional<Time> until;
   for (const Source& source : sources_) {
@@ -471,7 +481,17 @@ Result<void> Recorder::add_to_file(Source& source) {
       opener_.described(reader.id(), reader.incarnation()).value_or(reader.type());
   source.number = DSSM_TRY(file_->add_stream(
       {reader.id(), type, reader.depth(), reader.cycle(), reader.incarnation(), source.property}));
-  source.has_fields = !type.fields.empty();
+  source.fields_from.reset();
+  if (!type.fields.empty()) source.fields_from = 0;
+  return {};
+}
+
+Result<void> Recorder::describe(const StreamId& id) {
+  for (Source& source : sources_) {
+    if (source.reader.id() != id || source.fields_from) continue;
+    DSSM_TRY(add_to_file(source));
+    if (source.fields_from) source.fields_from = progress().files;
+  }
   return {};
 }
 
@@ -711,8 +731,10 @@ bool Recorder::has_past() const {
 
 std::vector<std::string> Recorder::streams_without_fields() const {
   std::vector<std::string> names;
+  const std::uint32_t files = progress().files;
   for (const Source& source : sources_) {
-    if (!source.has_fields) names.push_back(source.reader.id().str());
+    const bool has_fields = source.fields_from && *source.fields_from < files;
+    if (!has_fields) names.push_back(source.reader.id().str());
   }
   return names;
 }

@@ -144,7 +144,8 @@ class Recorder {
     bool is_of_now = true;            // its stamps are of this time, and not of one that is played
     std::vector<std::byte> property;  // that the file has, or gets at its beginning
     std::vector<NewProperty> new_properties;  // the file has not yet
-    bool has_fields = false;                  // in the file
+    // The number of the recording's first file that has its fields; empty: it has none.
+    std::optional<std::uint32_t> fields_from = {};
     // Its reader cannot continue, or another source has the ring that it would continue with.
     bool is_over = false;
   };
@@ -173,6 +174,8 @@ class Recorder {
     std::vector<std::pair<StreamId, NewProperty>> take_properties();
     // The stream's type, if it was described since begin().
     std::optional<TypeInfo> described(const StreamId& id, std::uint64_t incarnation) const;
+    // The streams that were described since the last call. To be called after take_opened().
+    std::vector<StreamId> take_described();
     std::vector<std::string> take_notices();
     bool has_tried_all() const;  // of the streams that there were at begin()
 
@@ -224,6 +227,7 @@ class Recorder {
     std::vector<std::pair<StreamId, NewProperty>> properties_;  // fetched
     // Incarnations and types, by the streams' names.
     std::map<std::string, std::pair<std::uint64_t, TypeInfo>> described_;
+    std::vector<StreamId> newly_described_;
     std::vector<std::string> notices_;
     std::optional<MonoTime> stop_at_;
 
@@ -241,6 +245,8 @@ class Recorder {
   Duration next_period();
   Result<void> add(Source source);
   Result<void> add_to_file(Source& source);
+  // Its description counts from the next file on.
+  Result<void> describe(const StreamId& id);
   void want_past(Source& source) const;
   // take(); samples that are later than `held_from` may wait for earlier ones of other streams.
   Result<void> take_until(Time held_from);

@@ -89,6 +89,8 @@ std::uint64_t Summary::payload_bytes() const noexcept {
 }
 
 void Chunk::clear() noexcept {
+  begins_file = false;
+  descriptions.clear();
   channels.clear();
   properties.clear();
   gaps.clear();

@@ -96,6 +96,12 @@ struct NewChannel {
   Schema schema;
   Channel channel;
 };
+// A channel whose type has another description than before.
+struct NewDescription {
+  std::uint16_t channel = 0;
+  Schema schema;
+  TypeInfo type;
+};
 struct NewProperty {
   std::uint16_t channel = 0;
   std::vector<std::byte> property;
@@ -104,6 +110,9 @@ struct NewProperty {
 
 // What one chunk of the file is made from. `messages` are whole message records.
 struct Chunk {
+  // It is the first one of a file, in which these descriptions hold.
+  bool begins_file = false;
+  std::vector<NewDescription> descriptions;
   // Come before the messages.
   std::vector<NewChannel> channels;
   std::vector<NewProperty> properties;

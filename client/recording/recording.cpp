@@ -143,12 +143,13 @@ Result<void> Content::add(std::uint32_t number) {
       life.group = static_cast<std::size_t>(group - groups.begin());
       group->lives.push_back(at);
     } else {
-      if (channel.stream && known->type != about.type) {
+      if (channel.stream && !about.type.check_usable_as(known->type)) {
         return Error{Errc::conflict,
                      fmt::format("recording '{}': stream '{}' has another type there than in the "
                                  "files before; open it separately",
                                  file.path().string(), about.id.str())};
       }
+      if (known->type.is_less_described_than(about.type)) known->type = about.type;
       known->type.payload_bytes = std::max(known->type.payload_bytes, about.type.payload_bytes);
     }
     add_properties(at, number, channel);

@@ -143,13 +143,17 @@ Channel channel_of(const RecordedStream& stream) {
       {"incarnation", std::to_string(stream.incarnation)},
       {"depth", std::to_string(stream.depth)},
       {"cycle_ns", std::to_string(to_ns(stream.cycle))},
-      {"type", stream.type.name},
-      {"payload_bytes", std::to_string(stream.type.payload_bytes)},
-      {"alignment_bytes", std::to_string(stream.type.alignment_bytes)},
-      {"fields", text_of(stream.type.fields)},
   };
   for (const auto& [key, value] : own) channel.metadata[key] = value;
+  set_type(channel, stream.type);
   return channel;
+}
+
+void set_type(Channel& channel, const TypeInfo& type) {
+  channel.metadata["type"] = type.name;
+  channel.metadata["payload_bytes"] = std::to_string(type.payload_bytes);
+  channel.metadata["alignment_bytes"] = std::to_string(type.alignment_bytes);
+  channel.metadata["fields"] = text_of(type.fields);
 }
 
 Result<std::optional<RecordedStream>> stream_of(const Channel& channel) {

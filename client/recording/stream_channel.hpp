@@ -47,6 +47,9 @@ std::string topic_of(const StreamId& id);
 // The metadata of a stream's channel, without ids.
 Channel channel_of(const RecordedStream& stream);
 
+// Gives such a channel another description of its type.
+void set_type(Channel& channel, const TypeInfo& type);
+
 // The stream of a channel that channel_of() made; its property is empty. nullopt: another program
 // made the channel.
 //   fails  protocol

@@ -115,7 +115,13 @@ Result<std::uint32_t> Writer::add_stream(const RecordedStream& stream) {
   DSSM_TRY(stream.type.check(), what);
   const std::unique_lock lock(mutex_);
   const std::pair key(topic_of(stream.id), stream.incarnation);
-  if (const auto known = numbers_.find(key); known != numbers_.end()) return known->second;
+  if (const auto known = numbers_.find(key); known != numbers_.end()) {
+    const TypeInfo& type = streams_[known->second].type;
+    if (type.is_less_described_than(stream.type) && stream.type.check_usable_as(type)) {
+      described_[known->second] = stream.type;
+    }
+    return known->second;
+  }
   DSSM_TRY(check());
   if (streams_.size() == kMaxStreams) {
     return Error{Errc::limit_exceeded,
@@ -157,6 +163,17 @@ void Writer::begin_chunk() {
   if (!open_->is_empty()) return;
   open_since_ = MonoClock::now();
   disk_.notify_one();
+}
+
+// What is already encoded has the earlier descriptions, and comes into the file before.
+void Writer::begin_described_file() {
+  if (!open_->is_empty()) take_open_chunk();
+  open_->begins_file = true;
+  for (auto& [number, type] : described_) {
+    open_->descriptions.push_back({static_cast<std::uint16_t>(number + 1), schema_for(type), type});
+    streams_[number].type = std::move(type);
+  }
+  described_.clear();
 }
 
 // Hands the open chunk to the disk's thread.
@@ -321,6 +338,10 @@ void Writer::run_disk() {
       disk_.wait(lock);
       continue;
     }
+    if (!described_.empty() && !is_ending_file_ && is_file_full(*waiting_.front())) {
+      begin_described_file();
+      is_ending_file_ = true;
+    }
     std::unique_ptr<Chunk> chunk = std::move(waiting_.front());
     waiting_.pop_front();
     std::optional<Error> failed = sync_error_;
@@ -359,7 +380,16 @@ void Writer::run_disk() {
 
 // Writes what `chunk` holds, in the next file if the current one is full.
 Result<void> Writer::store(const Chunk& chunk) {
-  if (is_file_full(chunk)) DSSM_TRY(begin_file());
+  for (const NewDescription& described : chunk.descriptions) {
+    NewChannel& channel = disk_streams_[described.channel - 1U].channel;
+    channel.schema = described.schema;
+    channel.channel.schema_id = described.schema.id;
+    set_type(channel.channel, described.type);
+  }
+  if (chunk.begins_file || (!is_ending_file_ && is_file_full(chunk))) {
+    is_ending_file_ = false;
+    DSSM_TRY(begin_file());
+  }
   for (const NewChannel& channel : chunk.channels) {
     for (DiskStream& earlier : disk_streams_) {
       if (earlier.channel.channel.topic == channel.channel.topic) earlier.replaced = true;

@@ -70,6 +70,8 @@ class Writer {
   void take_open_chunk();
   void close_chunk(std::unique_lock<std::mutex>& lock);
   void begin_chunk();
+  // Begins a chunk that begins a file, in which described_ hold.
+  void begin_described_file();
   const Schema& schema_for(const TypeInfo& type);
   Chunk::IndexedPart& part_of(std::uint32_t stream);
 
@@ -95,6 +97,7 @@ class Writer {
   std::map<std::pair<std::string, std::uint64_t>, std::uint32_t> numbers_;  // topic, incarnation
   std::map<std::pair<std::string, std::string>, Schema> schemas_;           // by name and text
   std::set<std::string> schema_names_;
+  std::map<std::uint32_t, TypeInfo> described_;  // of streams_, from the next file on
   std::unique_ptr<Chunk> open_;
   std::uint64_t chunk_number_ = 1;
   MonoTime open_since_{};                       // of the first thing in open_
@@ -114,6 +117,7 @@ class Writer {
   FileWriter current_;
   std::uint32_t file_number_ = 0;  // in its name
   std::vector<DiskStream> disk_streams_;
+  bool is_ending_file_ = false;  // a chunk with begins_file is to come
   std::deque<std::pair<std::filesystem::path, std::uint64_t>> finished_files_;
   std::uint64_t written_bytes_ = 0;  // to all files but the current one
   std::uint64_t written_samples_ = 0, written_payload_bytes_ = 0;  // the same

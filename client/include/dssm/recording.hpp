@@ -71,7 +71,7 @@ struct RecordingOptions {
   std::uint64_t queue_bytes = 64U << 20;
   // A file that has so many bytes, or holds samples of so long a time, is followed by another one:
   // NAME.mcap, NAME_1.mcap, NAME_2.mcap ... A file may become longer than this by one chunk and its
-  // summary. 0: one file.
+  // summary; before one with new descriptions of types, by what waits for the disk. 0: one file.
   std::uint64_t max_file_bytes = 0;
   Duration max_file_duration{};
   // Of all files of this recording: the oldest ones are deleted when there are more. Without
@@ -106,7 +106,8 @@ class RecordingWriter {
   ~RecordingWriter();
 
   // The number of the stream in this recording, for the other calls. The same stream (id and
-  // incarnation) again: the same number; what else `stream` has is ignored then.
+  // incarnation) again: the same number. A name or fields that its type lacked hold from the next
+  // file on then; what else `stream` has is ignored.
   //   fails  invalid_argument (a name or type that is not allowed), limit_exceeded
   //          (more than 65,535 streams), and as write()
   Result<std::uint32_t> add_stream(const RecordedStream& stream);

@@ -15,10 +15,11 @@ namespace {
 class RecorderOf : public CtlTest {
  protected:
   // Until it has the stream open. Nothing is taken then until the test does.
-  void start(const StreamId& id) {
-    recorder_ = ctl::Recorder::start(session_with(daemon_), RecordingWriter::create(file_).value(),
-                                     {ctl::StreamFilter({}, {}), {}, {}, {}, false})
-                    .value();
+  void start(const StreamId& id, const RecordingOptions& how = {}) {
+    recorder_ =
+        ctl::Recorder::start(session_with(daemon_), RecordingWriter::create(file_, how).value(),
+                             {ctl::StreamFilter({}, {}), {}, {}, {}, false})
+            .value();
     await_opened(id);
     ASSERT_TRUE(recorder_->take());
     ASSERT_EQ(recorder_->streams(), 1U);
@@ -75,6 +76,44 @@ TEST_F(RecorderOf, AStreamOfAnotherTypeLosesWhatItsRingOverwroteBeforeItWasOpene
   const RecordingProgress progress = recorder_->progress();
   EXPECT_GT(progress.samples, 0U);
   EXPECT_EQ(progress.samples + progress.lost_samples, 1000U);
+}
+
+struct RecordedVolts {
+  double volts;
+};
+DSSM_DESCRIBE(RecordedVolts, volts)
+
+TEST_F(RecorderOf, AStreamHasItsDescriptionFromTheNextFileOn) {
+  const TypeInfo unnamed{"", sizeof(RecordedVolts), 1, {}};
+  RawWriter writer = session_.create_raw({"again", 0, ""}, unnamed, depth_of(64)).value();
+  RecordingOptions how;
+  how.chunk_bytes = how.max_file_bytes = 1;
+  start(writer.id(), how);
+  std::int64_t written = 0;
+  const auto take_until_files = [&](std::uint32_t files) {
+    await([&] {
+      writer.write(std::as_bytes(std::span(&written, 1)));
+      ++written;
+      EXPECT_TRUE(recorder_->take());
+      return recorder_->progress().files >= files;
+    });
+  };
+  take_until_files(2);
+  EXPECT_EQ(recorder_->streams_without_fields(), std::vector<std::string>{"again:0@pc1"});
+  ASSERT_TRUE(session_.describe(writer.id(), type_of<RecordedVolts>()));
+  await([&] {
+    take_until_files(recorder_->progress().files + 1);
+    return recorder_->streams_without_fields().empty();
+  });
+  take_until_files(recorder_->progress().files + 3);
+  ASSERT_TRUE(recorder_->finish());
+  EXPECT_TRUE(Recording::open(file_).value().streams()[0].type.fields.empty());
+  const Recording recording = Recording::open(folder_.path()).value();
+  EXPECT_EQ(Recording::open(recording.files().back()).value().streams()[0].type,
+            type_of<RecordedVolts>());
+  ASSERT_EQ(recording.streams().size(), 1U);
+  EXPECT_EQ(recording.streams()[0].type, type_of<RecordedVolts>());
+  EXPECT_EQ(recording.streams()[0].samples, static_cast<std::uint64_t>(written));
 }
 
 }  // namespace

@@ -275,6 +275,36 @@ TEST_F(RecordingFiles, SplitsBySizeAndOpensTheFolderAsOne) {
   EXPECT_EQ(Recording::open(folder_).error().code, Errc::conflict);
 }
 
+TEST_F(RecordingFiles, HaveADescriptionFromTheNextFileOn) {
+  RecordingOptions options;
+  options.chunk_bytes = 500;
+  options.queue_bytes = 1000;
+  options.max_file_bytes = 4000;
+  RecordingWriter writer = RecordingWriter::create(path("a.mcap"), options).value();
+  RecordedStream about = plain_stream("s", 24);
+  const auto stream = writer.add_stream(about).value();
+  std::vector<Recorded> written;
+  const auto write_until = [&](std::uint32_t files) {
+    while (writer.progress().files < files) {
+      const auto tid = static_cast<Tid>(written.size());
+      written.push_back(sample_at(tid, tid, tid % 5 == 0 ? 20 : 24));  // also short ones
+      write(writer, stream, written.back());
+    }
+  };
+  write_until(3);
+  about.type = {"Point", 24, 8, {{"x", Scalar::float64, 0, 1}, {"y", Scalar::float64, 8, 1}}};
+  EXPECT_EQ(writer.add_stream(about).value(), stream);
+  write_until(6);
+  ASSERT_TRUE(writer.finish());
+
+  EXPECT_TRUE(open_recording(path("a_1.mcap")).streams()[0].type.fields.empty());
+  EXPECT_EQ(open_recording(path("a_5.mcap")).streams()[0].type, about.type);
+  const Recording recording = open_recording(folder_);
+  ASSERT_EQ(recording.streams().size(), 1U);
+  EXPECT_EQ(recording.streams()[0].type, about.type);
+  EXPECT_EQ(all_of(recording), written);
+}
+
 TEST_F(RecordingFiles, SplitsByTimeOfTheSamples) {
   RecordingOptions options;
   options.chunk_bytes = 100;
