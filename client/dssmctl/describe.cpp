@@ -173,6 +173,8 @@ Json stream_json(const StreamInfo& stream) {
   json["channels"] = when_known(stream.channels);
   json["crashed_writers"] = stream.crashed_writers;
   json["last_crashed_writer"] = or_null(stream.last_crashed_writer);
+  json["crashed_readers"] = stream.crashed_readers;
+  json["last_crashed_reader"] = or_null(stream.last_crashed_reader);
   json["memory_bytes"] = stream.memory_bytes;
   json["property_bytes"] = stream.property_bytes;
   json["incarnation"] = stream.incarnation;

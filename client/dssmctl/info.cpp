@@ -125,11 +125,16 @@ void print_stream(const StreamInfo& stream, bool iso, Output& out) {
   add_line(
       out, "channels",
       fmt::format("{} to other hosts, for programs there", count_text(stream, stream.channels)));
+  const auto add_crashed = [&](const std::string& programs, const std::string& last) {
+    add_line(
+        out, "crashed",
+        fmt::format("{} ended without closing it, the last one was {}", programs, escaped(last)));
+  };
   if (stream.crashed_writers > 0) {
-    add_line(out, "crashed",
-             fmt::format("{} ended without closing it, the last one was {}",
-                         counted(stream.crashed_writers, "writer", "writers"),
-                         escaped(stream.last_crashed_writer)));
+    add_crashed(counted(stream.crashed_writers, "writer", "writers"), stream.last_crashed_writer);
+  }
+  if (stream.crashed_readers > 0) {
+    add_crashed(counted(stream.crashed_readers, "reader", "readers"), stream.last_crashed_reader);
   }
   add_line(out, "memory", bytes_text(stream.memory_bytes));
   add_line(out, "property", stream.property_bytes ? bytes_text(stream.property_bytes) : "none");

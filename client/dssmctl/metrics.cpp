@@ -216,6 +216,9 @@ void add_streams(std::string& text, const std::vector<StreamInfo>& streams) {
   add("dssm_stream_crashed_writers", "counter",
       "Programs that had the stream open to write and ended without closing it.",
       [](const StreamInfo& stream) { return stream.crashed_writers; });
+  add("dssm_stream_crashed_readers", "counter",
+      "Programs that had the stream open to read and ended without closing it.",
+      [](const StreamInfo& stream) { return stream.crashed_readers; });
 }
 
 // Of other hosts' streams that are read here.

@@ -194,13 +194,17 @@ void TriggerEvaluator::on_lists(const std::vector<StreamInfo>& streams,
     Known& known = at->second;
     // What happened before it was seen is unknown.
     if (is_new || known.incarnation != stream.incarnation) {
-      known = {stream.id, stream.incarnation, stream.crashed_writers, false};
+      known = {stream.id, stream.incarnation, stream.crashed_writers, stream.crashed_readers,
+               false};
     }
     for (const TriggerRule& rule : rules_) check_stream(rule, stream, known, now);
     // Of a host that does not answer just now, the list has an earlier number. (A lower one counts
     // otherwise: its dssmd was restarted.)
     const bool is_earlier = stream.state == StreamState::unknown && stream.newest == kNoTid;
-    if (!is_earlier) known.crashed_writers = stream.crashed_writers;
+    if (!is_earlier) {
+      known.crashed_writers = stream.crashed_writers;
+      known.crashed_readers = stream.crashed_readers;
+    }
     known.live = stream.state == StreamState::live || (known.live && !is_silent(stream));
   }
   // A host that is lost takes its streams from the list.
@@ -234,11 +238,14 @@ void TriggerEvaluator::check_stream(const TriggerRule& rule, const StreamInfo& s
           fmt::format("'{}' is stalled: no sample for {}", stream.id.str(), age_text(stream)),
           stream.id.host, now});
   }
-  if (rule.kind == Kind::crashed && stream.crashed_writers > before.crashed_writers) {
-    fire({rule.name,
-          fmt::format("{} ended without closing '{}'", stream.last_crashed_writer, stream.id.str()),
+  const auto check_crashed = [&](std::uint32_t crashed, std::uint32_t earlier,
+                                 const std::string& last) {
+    if (rule.kind != Kind::crashed || crashed <= earlier) return;
+    fire({rule.name, fmt::format("{} ended without closing '{}'", last, stream.id.str()),
           stream.id.host, now});
-  }
+  };
+  check_crashed(stream.crashed_writers, before.crashed_writers, stream.last_crashed_writer);
+  check_crashed(stream.crashed_readers, before.crashed_readers, stream.last_crashed_reader);
 }
 
 // The clock of a host that was good and is not. One that was not there before is unknown at first.

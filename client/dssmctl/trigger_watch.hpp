@@ -94,7 +94,7 @@ class TriggerEvaluator {
   struct Known {
     StreamId id;
     std::uint64_t incarnation = 0;
-    std::uint32_t crashed_writers = 0;
+    std::uint32_t crashed_writers = 0, crashed_readers = 0;
     bool live = false;  // it had samples, and was not reported as stalled
   };
   void check_stream(const TriggerRule& rule, const StreamInfo& stream, const Known& before,

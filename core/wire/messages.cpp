@@ -101,6 +101,8 @@ void to_message(const StreamInfo& info, proto::Stream& out) {
   out.set_channels(info.channels);
   out.set_crashed_writers(info.crashed_writers);
   out.set_last_crashed_writer(info.last_crashed_writer);
+  out.set_crashed_readers(info.crashed_readers);
+  out.set_last_crashed_reader(info.last_crashed_reader);
   out.set_state(static_cast<proto::Stream::State>(info.state));
   out.set_age_ns(to_ns(info.age));
   for (const StreamUser& user : info.users) to_message(user, *out.add_users());
@@ -184,7 +186,9 @@ StreamInfo stream_info(const proto::Stream& message) {
   info.readers = message.readers() + info.remote_readers;
   info.channels = message.channels();
   info.crashed_writers = message.crashed_writers();
-  info.last_crashed_writer = text_untrusted(message.last_crashed_writer(), kMaxCrashedWriterBytes);
+  info.last_crashed_writer = text_untrusted(message.last_crashed_writer(), kMaxCrashedProgramBytes);
+  info.crashed_readers = message.crashed_readers();
+  info.last_crashed_reader = text_untrusted(message.last_crashed_reader(), kMaxCrashedProgramBytes);
   info.state = enum_untrusted(message.state(), StreamState::no_writer);
   info.age = Duration(message.age_ns());
   for (const proto::User& user : message.users()) {

@@ -17,8 +17,8 @@ namespace dssm::wire {
 // A property is copied whole within one turn of dssmd's loop. What is longer is a sample.
 inline constexpr std::size_t kMaxPropertyBytes = 1U << 20;
 inline constexpr std::size_t kMaxProgramBytes = 127;
-inline constexpr std::size_t kMaxCrashedWriterBytes = 150;  // a program and its pid
-inline constexpr std::size_t kMaxSentenceBytes = 511;       // for people, of another host
+inline constexpr std::size_t kMaxCrashedProgramBytes = 150;  // a program and its pid
+inline constexpr std::size_t kMaxSentenceBytes = 511;        // for people, of another host
 
 // The value of an enum that came in a message; when it is beyond `last`, the first one, which means
 // that nothing is known.

@@ -53,7 +53,7 @@ OpenNumber OpenTable::add(OpenEntry entry) {
   OfStream& of_stream = by_stream_[added.stream.get()];
   of_stream.opens.insert(number);
   ++(added.role == Role::writer ? of_stream.counts.writers : of_stream.counts.readers);
-  if (added.role == Role::writer) ++of_stream.writing[added.client->number];
+  ++(added.role == Role::writer ? of_stream.writing : of_stream.reading)[added.client->number];
   return number;
 }
 
@@ -92,17 +92,17 @@ void OpenTable::forget(OpenNumber number, bool crashed) {
   const auto of_stream = by_stream_.find(entry.stream.get());
   of_stream->second.opens.erase(number);
   Counts& counts = of_stream->second.counts;
-  --(entry.role == Role::writer ? counts.writers : counts.readers);
-  if (entry.role == Role::writer) {
-    const auto writing = of_stream->second.writing.find(entry.client->number);
-    if (--writing->second == 0) {
-      of_stream->second.writing.erase(writing);
-      entry.stream->remove_doorbell(entry.client->number);
-      // Once, however often it had the stream open.
-      if (crashed) {
-        entry.stream->add_crashed_writer(
-            fmt::format("{} (pid {})", entry.client->program, entry.client->pid));
-      }
+  const bool is_writer = entry.role == Role::writer;
+  --(is_writer ? counts.writers : counts.readers);
+  auto& uses = is_writer ? of_stream->second.writing : of_stream->second.reading;
+  const auto use = uses.find(entry.client->number);
+  if (--use->second == 0) {
+    uses.erase(use);
+    if (is_writer) entry.stream->remove_doorbell(entry.client->number);
+    // Once, however often it had the stream open.
+    if (crashed) {
+      entry.stream->add_crashed(
+          entry.role, fmt::format("{} (pid {})", entry.client->program, entry.client->pid));
     }
   }
   if (of_stream->second.opens.empty()) by_stream_.erase(of_stream);

@@ -60,7 +60,7 @@ class OpenTable {
   // Fails with not_found unless `number` is an open of `client`.
   Result<void> remove(ClientNumber client, OpenNumber number);
   // Some of the client's opens, in the order of opening.
-  //   crashed  the client ended without closing them: the streams that it wrote count it
+  //   crashed  the client ended without closing them: the streams that it wrote or read count it
   //   returns  whether there are more
   bool remove_some(ClientNumber client, bool crashed, std::size_t most);
 
@@ -89,7 +89,7 @@ class OpenTable {
   struct OfStream {
     std::set<OpenNumber> opens;
     Counts counts;
-    std::unordered_map<ClientNumber, std::uint32_t> writing;  // how many opens
+    std::unordered_map<ClientNumber, std::uint32_t> writing, reading;  // how many opens
   };
   void forget(OpenNumber number, bool crashed = false);
 

@@ -182,8 +182,10 @@ StreamInfo Stream::info(bool with_fields, Time now) const {
   info.incarnation = mapping_->identity().incarnation;
   info.creator_pid = plan_.creator_pid;
   info.channels = static_cast<std::uint32_t>(channels_.size());
-  info.crashed_writers = crashed_writers_;
-  info.last_crashed_writer = last_crashed_writer_;
+  info.crashed_writers = crashed_writers_.programs;
+  info.last_crashed_writer = crashed_writers_.last;
+  info.crashed_readers = crashed_readers_.programs;
+  info.last_crashed_reader = crashed_readers_.last;
   for (const Channel& channel : channels_) {
     info.remote_writers += channel.writers;
     info.remote_readers += channel.readers;

@@ -169,10 +169,11 @@ class Stream : public std::enable_shared_from_this<Stream> {
   void set_channel(Channel channel);
   void remove_channel(const void* key);
 
-  // A program that wrote it has ended without closing it.
-  void add_crashed_writer(std::string program) {
-    ++crashed_writers_;
-    last_crashed_writer_ = std::move(program);
+  // A program that had it open in that role has ended without closing it.
+  void add_crashed(Role role, std::string program) {
+    Crashed& crashed = role == Role::writer ? crashed_writers_ : crashed_readers_;
+    ++crashed.programs;
+    crashed.last = std::move(program);
   }
 
   // No later offer restores it.
@@ -182,6 +183,10 @@ class Stream : public std::enable_shared_from_this<Stream> {
  private:
   struct Files {
     UniqueFd ring, bell;
+  };
+  struct Crashed {
+    std::uint32_t programs = 0;
+    std::string last;
   };
   struct Doorbell {
     ClientNumber client;
@@ -206,8 +211,7 @@ class Stream : public std::enable_shared_from_this<Stream> {
   MemoryShare ring_share_, type_share_, property_share_;
   bool removed_ = false;
   std::vector<Channel> channels_;
-  std::uint32_t crashed_writers_ = 0;
-  std::string last_crashed_writer_;
+  Crashed crashed_writers_, crashed_readers_;
   DoorbellObserver* doorbell_observer_ = nullptr;
 };
 

@@ -104,7 +104,7 @@ Values values_of_the_code() {
       DSSM_COUNT(CatalogRequests::kMaxListedFields),
       DSSM_BYTES(wire::kMaxPropertyBytes),
       DSSM_COUNT(ring::kMaxPublishers),
-      DSSM_BYTES(wire::kMaxCrashedWriterBytes),
+      DSSM_BYTES(wire::kMaxCrashedProgramBytes),
       DSSM_BYTES(wire::kMaxSentenceBytes),
       DSSM_COUNT(kMaxClients),
       DSSM_COUNT(kMaxOpens),

@@ -233,11 +233,13 @@ struct StreamInfo {
   std::uint32_t remote_writers = 0;
   std::uint32_t remote_readers = 0;
   std::uint32_t channels = 0;  // connections from other hosts that carry it
-  // Programs of its host that had it open to write and ended without closing it, by a crash or a
-  // kill, since dssmd runs there and has the stream; and the last of them, for people: "driver (pid
-  // 12)".
+  // Programs of its host that had it open to write, or to read, and ended without closing it, by a
+  // crash or a kill, since dssmd runs there and has the stream; and the last of them, for people:
+  // "driver (pid 12)".
   std::uint32_t crashed_writers = 0;
   std::string last_crashed_writer;
+  std::uint32_t crashed_readers = 0;
+  std::string last_crashed_reader;
   std::vector<StreamUser> users;     // from Session::stream_info() only
   std::optional<MirrorInfo> mirror;  // the same; of another host's stream that is read here
 };

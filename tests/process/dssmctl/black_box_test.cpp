@@ -278,6 +278,26 @@ TEST_F(BlackBox, IsTriggeredByAProgramThatEndsWithoutClosing) {
   EXPECT_EQ(json({"info", "power"})["crashed_writers"], 1);
 }
 
+TEST_F(BlackBox, IsTriggeredByAReaderThatEndsWithoutClosing) {
+  const auto power = session_.create<Power>("power", depth_of(64)).value();
+  Running running(recorder({"--after", "1ms", "--trigger", "crash: crashed"}), environment());
+  await_armed(power.id());
+  const auto readers = [&] { return session_.stream_info(power.id()).value().readers; };
+  Running closes(argv({"echo", "power"}), environment());
+  await([&] { return readers() == 2; });
+  closes.signal(SIGINT);
+  EXPECT_EQ(closes.status(), 0);
+  await([&] { return readers() == 1; });
+  EXPECT_EQ(session_.stream_info(power.id()).value().crashed_readers, 0U);
+  Running crashes(argv({"echo", "power"}), environment());
+  await([&] { return readers() == 2; });
+  crashes.signal(SIGKILL);
+  const std::string line = running.line();
+  EXPECT_TRUE(contains(line, "trigger 'crash' of host 'pc1': dssmctl echo (pid ")) << line;
+  EXPECT_TRUE(contains(output({"info", "power"}), "1 reader ended without closing it"));
+  EXPECT_EQ(json({"info", "power"})["crashed_readers"], 1);
+}
+
 // dssmd of this test follows a chronyd of its own, without sources, which leaves the clock alone.
 class BlackBoxWithClock : public testing::Test {
  protected:

@@ -59,6 +59,7 @@ TEST_F(Metrics, HaveWhatIsKnownOfHostsStreamsAndDssmd) {
   EXPECT_EQ(value("dssm_stream_readers" + labels), 1);
   EXPECT_EQ(value("dssm_stream_writers" + labels), 1);
   EXPECT_EQ(value("dssm_stream_crashed_writers_total" + labels), 0);
+  EXPECT_EQ(value("dssm_stream_crashed_readers_total" + labels), 0);
   EXPECT_EQ(value("dssm_mirror_received_samples_total" + labels), 3);
   EXPECT_EQ(value("dssm_mirror_received_bytes_total" + labels), 24);
   EXPECT_EQ(value("dssm_mirror_lost_samples_total" + labels), 0);

@@ -215,6 +215,19 @@ TEST(TriggerEvaluator, FiresForEachWriterThatCrashesAndNotForThoseOfBefore) {
   EXPECT_TRUE(lists.show({stream("a", StreamState::live, 2, 2)}).empty()) << "another ring";
 }
 
+TEST(TriggerEvaluator, FiresForEachReaderThatCrashes) {
+  Lists lists("crashed a");
+  StreamInfo a = stream("a", StreamState::live);
+  a.crashed_readers = 3;
+  a.last_crashed_reader = "localizer (pid 34)";
+  EXPECT_TRUE(lists.show({a}).empty());
+  ++a.crashed_readers;
+  const auto fired = lists.show({a});
+  ASSERT_EQ(fired.size(), 1U);
+  EXPECT_EQ(fired[0].reason, "localizer (pid 34) ended without closing 'a:0@pc1'");
+  EXPECT_TRUE(lists.show({a}).empty());
+}
+
 TEST(TriggerEvaluator, RemembersTheCrashesOfAHostThatWasAway) {
   Lists lists("crashed");
   const std::vector away{host("pc2", HostState::down)}, here{host("pc2", HostState::up)};

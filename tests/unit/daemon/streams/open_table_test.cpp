@@ -52,22 +52,31 @@ TEST_F(OpenTableTest, ForgetsAllOfAClientThatLeft) {
   EXPECT_EQ(table_.entries().size(), 1u);
 }
 
-TEST_F(OpenTableTest, CountsWritersThatCrashedOnceForEachStreamThatTheyWrote) {
+TEST_F(OpenTableTest, CountsProgramsThatCrashedOnceForEachStreamThatTheyWroteOrRead) {
   const auto a = stream("a"), b = stream("b"), c = stream("c");
   table_.set_limits({.max_opens = 9, .max_opens_per_client = 9});
   table_.add({client(1), a, Role::writer, 0});
   table_.add({client(1), a, Role::writer, 0});
   table_.add({client(1), b, Role::reader, 0});
+  table_.add({client(1), b, Role::reader, 0});
   const OpenNumber closed = table_.add({client(1), c, Role::writer, 0});
+  const OpenNumber closed_too = table_.add({client(1), c, Role::reader, 0});
   table_.add({client(2), a, Role::writer, 0});
+  table_.add({client(2), b, Role::reader, 0});
   ASSERT_TRUE(table_.remove(1, closed));
+  ASSERT_TRUE(table_.remove(1, closed_too));
   EXPECT_FALSE(table_.remove_some(1, true, 100));
   EXPECT_EQ(a->info().crashed_writers, 1u);
   EXPECT_EQ(a->info().last_crashed_writer, client(1)->program + " (pid 1001)");
+  EXPECT_EQ(a->info().crashed_readers, 0u);
   EXPECT_EQ(b->info().crashed_writers, 0u);
+  EXPECT_EQ(b->info().crashed_readers, 1u);
+  EXPECT_EQ(b->info().last_crashed_reader, client(1)->program + " (pid 1001)");
   EXPECT_EQ(c->info().crashed_writers, 0u);
+  EXPECT_EQ(c->info().crashed_readers, 0u);
   EXPECT_FALSE(table_.remove_some(2, false, 100));
   EXPECT_EQ(a->info().crashed_writers, 1u);
+  EXPECT_EQ(b->info().crashed_readers, 1u);
 }
 
 TEST_F(OpenTableTest, NamesTheLimitThatIsReached) {
