@@ -28,7 +28,9 @@
 #include <deque>
 #include <dssm/clock.hpp>
 #include <dssm/dssm.hpp>
+#include <limits>
 #include <memory>
+#include <mutex>
 #include <nlohmann/json.hpp>
 #include <optional>
 #include <string>
@@ -60,16 +62,21 @@ std::int64_t now_ns(clockid_t clock) {
 
 std::int64_t raw_now_ns() { return now_ns(CLOCK_MONOTONIC_RAW); }
 
-// For how long the PC slept since its boot, at most. Its raw and its monotonic clock stand still
-// then.
-std::int64_t slept_ns() {
-  static std::atomic<std::int64_t> known = -1;
+// How often the PC slept, as far as this program noticed: its raw and its monotonic clock stand
+// still meanwhile. Each reading of two clocks bounds the time that it has slept since its boot.
+std::int64_t sleeps() {
+  static std::mutex mutex;
+  static std::int64_t count = 0, least_ns = 0, most_ns = std::numeric_limits<std::int64_t>::max();
   const std::int64_t before = now_ns(CLOCK_MONOTONIC), boot = now_ns(CLOCK_BOOTTIME);
-  const std::int64_t at_least = boot - now_ns(CLOCK_MONOTONIC);
-  std::int64_t slept = known;
-  while (at_least > slept && !known.compare_exchange_weak(slept, boot - before)) {
+  const std::int64_t at_least = boot - now_ns(CLOCK_MONOTONIC), at_most = boot - before;
+  const std::lock_guard lock(mutex);
+  if (at_least > most_ns) {
+    ++count;
+    least_ns = at_least, most_ns = at_most;
+  } else if (at_most >= least_ns) {  // else another thread has noticed a sleep meanwhile
+    least_ns = std::max(least_ns, at_least), most_ns = std::min(most_ns, at_most);
   }
-  return known;
+  return count;
 }
 
 // An interrupted reading is inaccurate, so it is repeated.
@@ -85,7 +92,7 @@ Clocks read_clocks() {
     const std::int64_t mono = MonoClock::now().time_since_epoch().count();
     const std::int64_t within = raw_now_ns() - before;
     if (i == 0 || within < best.within_ns)
-      best = {wall, mono, before + within / 2, within, start + slept_ns()};
+      best = {wall, mono, before + within / 2, within, start + sleeps()};
     if (within < kQuickEnoughNs) break;
   }
   return best;
