@@ -8,6 +8,7 @@
 
 #include "core/base/unique_fd.hpp"
 #include "tests/process/fleet/fleet_tools.hpp"
+#include "tests/support/authority.hpp"
 
 namespace dssm::test {
 namespace {
@@ -77,6 +78,25 @@ TEST(FleetPeers, AreDownWhileTheyHangAndUpAfterwards) {
   EXPECT_TRUE(on1.list_streams().value().empty());
   ::kill(pc2.pid(), SIGCONT);
   await_list(on1, {"kept:0@pc2"});
+}
+
+// As where the clock of a PC is behind until chronyd sets it right.
+TEST(FleetPeers, AreUpOnceTheirCertificatesAreValidByTheClock) {
+  const std::filesystem::path folder = make_temp_dir();
+  Authority authority;
+  Authority::Subject later = Authority::host("pc2");
+  later.valid_from = 4s;
+  const Time valid = WallClock::now() + 3s;  // certificates have whole seconds
+  authority.issue(later, folder / "pc2");
+  authority.issue(Authority::host("pc1"), folder / "pc1");
+  {
+    const DaemonProcess pc2({"--credentials", folder / "pc2"}, "pc2");
+    const DaemonProcess pc1({"--credentials", folder / "pc1", "--peer", pc2.address()});
+    Session session = connect(pc1);
+    await_state(session, pc2, HostState::up);
+    EXPECT_GE(WallClock::now(), valid);
+  }
+  remove_tree(folder);
 }
 
 TEST(FleetPeers, MayStartLater) {
