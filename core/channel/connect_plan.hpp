@@ -7,11 +7,11 @@
 //   round   tries all addresses, in turn, until one connects. When the other side did not greet, or
 //           the connection was given up, the next round begins with the address after it
 //   pause   between rounds, from kFirstPause on, doubled each time, up to kMaxPause. It starts
-//           again with kFirstPause after a connection that was useful
+//           again with kFirstPause after a connection that was useful, and after on_no_answer()
 //   recent  for kRecentTime after a useful connection on a fast network, attempts and pauses are
-//           short and first packets are repeated, unless the other side accepts connections and
-//           ends them. What ended the useful one, as a cut cable or a restart, is usually soon
-//           over, and the kernel repeats a first packet that was lost only after 1 s
+//           short, unless the other side accepts connections and ends them. What ended the useful
+//           one, as a cut cable or a restart, is usually soon over, and the kernel repeats a first
+//           packet that was lost only after 1 s. A dssmd sends others meanwhile (repeat_after())
 #pragma once
 
 #include <dssm/result.hpp>

@@ -7,7 +7,10 @@
 namespace dssm::daemon {
 
 TurnQueue::Turn::Turn(TurnQueue& queue, std::string account, std::function<void()> take)
-    : queue_(queue), account_(std::move(account)), take_(std::move(take)) {}
+    : queue_(queue),
+      requests_(account, Reason::request),
+      events_(std::move(account), Reason::event),
+      take_(std::move(take)) {}
 
 bool TurnQueue::Turn::may_begin() {
   if (is_called_ || (queue_.waiting_.empty() && queue_.used_ < kMaxTurn)) return true;
@@ -18,18 +21,19 @@ bool TurnQueue::Turn::may_begin() {
 void TurnQueue::Turn::wait(Reason reason) {
   if (is_waiting_ && reason >= reason_) return;
   stop();
+  const Account& account = reason == Reason::event ? events_ : requests_;
+  of_account_ = queue_.waiting_.try_emplace(account).first;
+  used_ = std::max(used_, queue_.least_);
+  place_ = of_account_->second.emplace(used_, this);
   is_waiting_ = true;
   reason_ = reason;
-  used_ = std::max(used_, queue_.least_);
-  place_ = queue_.waiting_[{account_, reason_}].emplace(used_, this);
   queue_.next_.enable_in(Duration::zero());
 }
 
 void TurnQueue::Turn::stop() noexcept {
   if (!std::exchange(is_waiting_, false)) return;
-  const auto of_account = queue_.waiting_.find({account_, reason_});
-  of_account->second.erase(place_);
-  if (of_account->second.empty()) queue_.waiting_.erase(of_account);
+  of_account_->second.erase(place_);
+  if (of_account_->second.empty()) queue_.waiting_.erase(of_account_);
 }
 
 void TurnQueue::run() {

@@ -17,8 +17,8 @@ namespace dssm::daemon {
 // as the last piece of work takes. Those that have to wait are called later: one account after
 // another, for kMaxVisit each, and of an account the client that has used the least time in such
 // calls. So a program that asks for little does not wait for hundreds that always have more to do.
-// What clients asked for and what they get unasked take turns, too, as if these were of two
-// accounts: an answer does not wait until hundreds of programs got the news.
+// A client that waits with requests and one that waits for events take turns, too, as if they were
+// of two accounts: an answer does not wait until hundreds of programs got their events.
 //
 //   threads  one
 class TurnQueue {
@@ -26,10 +26,12 @@ class TurnQueue {
   static constexpr Duration kMaxTurn = std::chrono::milliseconds(1);
   static constexpr Duration kMaxVisit = kMaxTurn / 2;
 
-  enum class Reason { request, news };
+  enum class Reason { request, event };
 
   class Turn;
   using Waiting = std::multimap<Duration, Turn*>;  // of one account, by what they have used
+  using Account = std::pair<std::string, Reason>;
+  using AllWaiting = std::map<Account, Waiting>;
 
   // One client's place.
   class Turn {
@@ -44,7 +46,7 @@ class TurnQueue {
 
     // Whether the client may work now. If not, it waits.
     bool may_begin();
-    // Of a client that waits already, news become a request, and not the other way round.
+    // A client that waits for events may begin to wait with a request, not the other way round.
     void wait(Reason reason = Reason::request);
     bool is_waiting() const noexcept { return is_waiting_; }
     void stop() noexcept;  // it does not wait any more
@@ -52,12 +54,13 @@ class TurnQueue {
    private:
     friend class TurnQueue;
     TurnQueue& queue_;
-    const std::string account_;
+    const Account requests_, events_;
     const std::function<void()> take_;
     Reason reason_{};  // of its last wait
     bool is_waiting_ = false, is_called_ = false;
-    Duration used_{};            // of the loop's time, when it was called; at least `least_`
-    Waiting::iterator place_{};  // while it waits
+    Duration used_{};  // of the loop's time, when it was called; at least `least_`
+    AllWaiting::iterator of_account_{};  // this and the next: while it waits
+    Waiting::iterator place_{};
   };
 
   // Measures a piece of work from its construction to its end.
@@ -79,9 +82,7 @@ class TurnQueue {
   void run();
   void call(Turn& turn);
 
-  using Account = std::pair<std::string, Reason>;
-
-  std::map<Account, Waiting> waiting_;  // none is empty
+  AllWaiting waiting_;  // none is empty
   // The greatest `used_` of a client that was called. A client that begins to wait gets at least
   // this: otherwise a new one, or one that was idle, would be called again and again until it has
   // used as much as the others.

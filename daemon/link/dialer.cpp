@@ -219,8 +219,7 @@ void Dialer::on_timer() {
     case State::connect:
       if (reason_) return try_next_address(*std::exchange(reason_, {}));
       if (loop_.now() - attempts_.front().began < plan_.connect_timeout()) {
-        // Where this fails at once, the attempts that wait find out, too.
-        static_cast<void>(begin_attempt());
+        static_cast<void>(begin_attempt());  // if it fails, those that wait still count
         return await_answer();
       }
       end_attempts();

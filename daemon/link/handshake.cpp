@@ -54,7 +54,7 @@ void Handshake::recognize() {
   unsigned char first[2] = {};
   const ssize_t count = ::recv(socket_.get(), first, sizeof first, MSG_PEEK | MSG_DONTWAIT);
   if (count < 0 && (errno == EAGAIN || errno == EINTR)) return;
-  if (count <= 0) return finish(Error{Errc::unavailable, "the other side closed the connection"});
+  if (count <= 0) return finish(std::unique_ptr<wire::Transport>());
   if (std::equal(first, first + count, wire::kTlsFirstBytes)) return go_on();
   if (takes_plain_) {
     return finish(wire::make_transport(std::move(socket_), wire::TransportEnd::accepted));

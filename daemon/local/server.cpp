@@ -231,14 +231,15 @@ void Connection::serve_frames() {
   if (!turn_.may_begin()) return readable_.disable();
   const TurnQueue::Work work(turns_);
   const MonoTime begin = MonoClock::now();
-  bool goes_on = false;
   for (int served = 0; is_open() && !is_paused(); ++served) {
     if (served == kRequestsPerTurn || (served > 0 && MonoClock::now() - begin > kMaxTurn)) {
       readable_.disable();
-      return turn_.wait(goes_on ? TurnQueue::Reason::news : TurnQueue::Reason::request);
+      return turn_.wait(waits_for_);
     }
-    goes_on = service_.go_on(number_);
-    if (goes_on || !is_open()) continue;
+    // The events that its requests cause have a turn of their own; the next requests go on.
+    const bool got_events = !turn_.is_waiting() && service_.go_on(number_);
+    waits_for_ = got_events ? TurnQueue::Reason::event : TurnQueue::Reason::request;
+    if (got_events || !is_open()) continue;
     const auto frame = input_.next();
     if (!frame) return end_with(frame.error());
     if (!*frame) {
@@ -246,7 +247,6 @@ void Connection::serve_frames() {
       return;
     }
     if (!service_.on_frame_untrusted(number_, **frame, arrived_)) return close();
-    if (turn_.is_waiting()) return readable_.disable();  // for news that the request began
   }
   if (is_open()) readable_.disable();  // paused: on_writable() continues
 }
@@ -332,7 +332,7 @@ void Connection::on_writable() {
   if (output_.empty()) writable_.disable();
   charge(queued_bytes_, output_share_);
   // Whole frames may be waiting in input_; for them the socket does not become readable.
-  if (!is_paused()) turn_.wait(TurnQueue::Reason::news);
+  if (!is_paused()) turn_.wait(waits_for_);
 }
 
 // The final failure is sent as far as the socket takes it at once; the connection does not wait for

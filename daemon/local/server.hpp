@@ -130,7 +130,7 @@ class Connection final : public ClientOutput {
   ~Connection();
 
   void send(std::string bytes, std::vector<UniqueFd> descriptors) override;
-  void request_turn() override { turn_.wait(TurnQueue::Reason::news); }
+  void request_turn() override { turn_.wait(TurnQueue::Reason::event); }
 
  private:
   struct Outgoing {
@@ -187,6 +187,7 @@ class Connection final : public ClientOutput {
   std::optional<Progress> watched_;  // none: nothing waits
   TurnQueue& turns_;
   TurnQueue::Turn turn_;
+  TurnQueue::Reason waits_for_{};  // what it gets when it goes on
   EventSource readable_, writable_, greeting_timeout_, request_timeout_, output_timer_;
 };
 

@@ -139,6 +139,8 @@ void ChannelServer::on_secured(Arrival& arrival, const wire::SocketAddress& addr
                                Result<std::unique_ptr<wire::Transport>> transport) {
   arrival.ended = true;
   sweep_.enable_in(Duration::zero());
+  // A host connects several times beside each other, and keeps one (ConnectPlan::repeat_after()).
+  if (transport && !*transport) return;
   if (!transport) {
     return logger_.warning(fmt::format("{}: {}", refuses(address), transport.error().message),
                            {.peer = address.str(), .message_id = message_id::kPeerRefused});

@@ -74,11 +74,11 @@ TEST_F(TurnQueueTest, ServesFirstWhoHasUsedLeast) {
   EXPECT_TRUE(was_called('1') && was_called('2') && was_called('3')) << called;
 }
 
-TEST_F(TurnQueueTest, ServesRequestsAndNewsInTurns) {
+TEST_F(TurnQueueTest, ServesRequestsAndEventsInTurns) {
   Client a1(*this, "a", "1"), a2(*this, "a", "2"), a3(*this, "a", "3"), asks(*this, "a", "?");
-  for (Client* one : {&a1, &a2, &a3, &asks}) one->turn.wait(TurnQueue::Reason::news);
+  for (Client* one : {&a1, &a2, &a3, &asks}) one->turn.wait(TurnQueue::Reason::event);
   asks.turn.wait();
-  asks.turn.wait(TurnQueue::Reason::news);  // still a request
+  asks.turn.wait(TurnQueue::Reason::event);  // still a request
   run_turns(loop, 2);
   EXPECT_EQ(called, "?1");
 }

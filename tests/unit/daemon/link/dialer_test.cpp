@@ -275,13 +275,16 @@ TEST_F(DialerTest, TriesSoonAgainAfterAUsefulConnectionIfItIsToRetryOften) {
     const Duration tried = loop.now() - lost - channel::ConnectPlan::kFirstPause;
     EXPECT_EQ(tried < channel::ConnectPlan::kConnectTimeout, retries_often);
     // The next round begins at once, and does not wait until the kernel repeats a lost packet.
+    const MonoTime began = MonoClock::now();
     wait([this] { return dialer->reached() == Dialer::Phase::connect; });
     wait_for(channel::ConnectPlan::kRecentTimeout / 4);
     silent.make_room();
     const bool is_found = is_done_within(2 * channel::ConnectPlan::kRepeat, [this] {
       return dialer->reached() == Dialer::Phase::greet;
     });
-    EXPECT_EQ(is_found, retries_often);
+    // The kernel counts real time, and the machine may have stopped this test meanwhile.
+    const bool was_repeated = MonoClock::now() - began > channel::ConnectPlan::kFirstRepeat / 2;
+    EXPECT_TRUE(is_found == retries_often || (is_found && was_repeated));
     EXPECT_EQ(downs.size(), 2u) << "in the same attempt";
   }
 }
