@@ -207,10 +207,11 @@ void Recorder::Opener::reopen(const RawReader& ended, const Error& error) {
       std::ranges::any_of(wanted_, [&](const Wanted& wanted) { return wanted.stream.id == id; });
   const bool is_opened =
       std::ranges::any_of(opened_, [&](const Source& source) { return source.reader.id() == id; });
-  if (is_wanted || is_opened) return;
+  if (is_opened) return;
+  known_.erase(id.str());  // `ended` is dropped: it continues with none that comes
+  if (is_wanted) return;
   notice_reopening(id, error.code == Errc::type_mismatch ? "its samples are of another type now"
                                                          : escaped_message(error.message));
-  known_.erase(id.str());
   Wanted wanted;
   wanted.stream.id = id;
   wanted.due = MonoClock::now();
