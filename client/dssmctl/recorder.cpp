@@ -420,9 +420,9 @@ Result<void> Recorder::take_until(Time held_from) {
     if (Result<void> one = add(std::move(opened)); !one && added) added = std::move(one);
   }
   for (auto& [id, property] : properties) add_property(id, std::move(property));
-  const std::vector<StreamId> described = opener_.take_described();
   DSSM_TRY(std::move(added));
   if (!is_recording_) {
+    (void)opener_.take_described();  // begin() asks for the descriptions of all
     check_readers();
     next_take_ = deadline_in(kMaxPeriod);
     return {};
@@ -431,7 +431,7 @@ Result<void> Recorder::take_until(Time held_from) {
     next_take_ = deadline_in(kMinPeriod);
     return {};
   }
-  for (const StreamId& id : described) DSSM_TRY(describe(id));
+  for (const StreamId& id : opener_.take_described()) DSSM_TRY(describe(id));
   filled_ = 0;
   std::optional<Time> until;
   for (const Source& source : sources_) {
