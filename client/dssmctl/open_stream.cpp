@@ -135,6 +135,7 @@ Result<Follower> Follower::open(Session& session, RawReader& reader, Output& out
         const bool is_removed = event.kind == StreamEvent::Kind::removed;
         observed->removed.store(is_removed, std::memory_order_relaxed);
         if (is_removed || event.stream.type.fields.empty()) return;
+        if (event.property_set && !event.described) return;  // it has the type that it had
         const std::lock_guard guard(observed->mutex);
         observed->described = event.stream;
       }));
