@@ -482,16 +482,12 @@ Result<void> Recorder::add_to_file(Source& source) {
       opener_.described(reader.id(), reader.incarnation()).value_or(reader.type());
   source.number = DSSM_TRY(file_->add_stream(
       {reader.id(), type, reader.depth(), reader.cycle(), reader.incarnation(), source.property}));
-  source.fields_from.reset();
-  if (!type.fields.empty()) source.fields_from = 0;
   return {};
 }
 
 Result<void> Recorder::describe(const StreamId& id) {
   for (Source& source : sources_) {
-    if (source.reader.id() != id || source.fields_from) continue;
-    DSSM_TRY(add_to_file(source));
-    if (source.fields_from) source.fields_from = progress().files;
+    if (source.reader.id() == id) DSSM_TRY(add_to_file(source));
   }
   return {};
 }
@@ -732,10 +728,8 @@ bool Recorder::has_past() const {
 
 std::vector<std::string> Recorder::streams_without_fields() const {
   std::vector<std::string> names;
-  const std::uint32_t files = progress().files;
   for (const Source& source : sources_) {
-    const bool has_fields = source.fields_from && *source.fields_from < files;
-    if (!has_fields) names.push_back(source.reader.id().str());
+    if (!file_->has_fields(source.number)) names.push_back(source.reader.id().str());
   }
   return names;
 }

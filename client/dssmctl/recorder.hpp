@@ -144,8 +144,6 @@ class Recorder {
     bool is_of_now = true;            // its stamps are of this time, and not of one that is played
     std::vector<std::byte> property;  // that the file has, or gets at its beginning
     std::vector<NewProperty> new_properties;  // the file has not yet
-    // The number of the recording's first file that has its fields; empty: it has none.
-    std::optional<std::uint32_t> fields_from = {};
     // Its reader cannot continue, or another source has the ring that it would continue with.
     bool is_over = false;
   };

@@ -296,6 +296,11 @@ Result<void> Writer::add_trigger(const RecordedTrigger& trigger) {
   return {};
 }
 
+bool Writer::has_fields(std::uint32_t stream) const {
+  const std::lock_guard lock(mutex_);
+  return stream < streams_.size() && !streams_[stream].type.fields.empty();
+}
+
 RecordingProgress Writer::progress() const {
   const std::lock_guard lock(mutex_);
   return progress_;
@@ -557,6 +562,8 @@ Result<void> RecordingWriter::set_property(std::uint32_t stream,
 Result<void> RecordingWriter::add_trigger(const RecordedTrigger& trigger) {
   return writer_->add_trigger(trigger);
 }
+
+bool RecordingWriter::has_fields(std::uint32_t stream) const { return writer_->has_fields(stream); }
 
 RecordingProgress RecordingWriter::progress() const { return writer_->progress(); }
 

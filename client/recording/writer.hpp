@@ -40,6 +40,7 @@ class Writer {
   Result<void> set_property(std::uint32_t stream, std::span<const std::byte> property,
                             std::optional<Time> from);
   Result<void> add_trigger(const RecordedTrigger& trigger);
+  bool has_fields(std::uint32_t stream) const;
   RecordingProgress progress() const;
   Result<void> finish();
 

@@ -112,6 +112,10 @@ class RecordingWriter {
   //          (more than 65,535 streams), and as write()
   Result<std::uint32_t> add_stream(const RecordedStream& stream);
 
+  // Whether a file that has begun, or begins with what waits for the disk, has fields of the
+  // stream: those of the first add_stream() or of a later one. No such stream: false.
+  bool has_fields(std::uint32_t stream) const;
+
   // Adds a sample, with the tid, time and clock error of `info`.
   //   stream       of add_stream()
   //   clock_error  bound on the distance of info.time from the recording PC's clock

@@ -295,6 +295,7 @@ TEST_F(RecordingFiles, HaveADescriptionFromTheNextFileOn) {
   about.type = {"Point", 24, 8, {{"x", Scalar::float64, 0, 1}, {"y", Scalar::float64, 8, 1}}};
   EXPECT_EQ(writer.add_stream(about).value(), stream);
   write_until(6);
+  EXPECT_TRUE(writer.has_fields(stream));
   ASSERT_TRUE(writer.finish());
 
   EXPECT_TRUE(open_recording(path("a_1.mcap")).streams()[0].type.fields.empty());
@@ -303,6 +304,18 @@ TEST_F(RecordingFiles, HaveADescriptionFromTheNextFileOn) {
   ASSERT_EQ(recording.streams().size(), 1U);
   EXPECT_EQ(recording.streams()[0].type, about.type);
   EXPECT_EQ(all_of(recording), written);
+}
+
+TEST_F(RecordingFiles, HaveNoDescriptionThatCameAfterTheLastFileBegan) {
+  RecordingWriter writer = RecordingWriter::create(path("a.mcap")).value();
+  const auto bytes = writer.add_stream(plain_stream("bytes", 24)).value();
+  EXPECT_TRUE(writer.has_fields(writer.add_stream(odometry_stream()).value()));
+  RecordedStream about = plain_stream("bytes", 24);
+  about.type = {"Point", 24, 8, {{"x", Scalar::float64, 0, 1}, {"y", Scalar::float64, 8, 1}}};
+  EXPECT_EQ(writer.add_stream(about).value(), bytes);
+  ASSERT_TRUE(writer.finish());
+  EXPECT_FALSE(writer.has_fields(bytes));
+  EXPECT_TRUE(open_recording(path("a.mcap")).streams()[0].type.fields.empty());
 }
 
 TEST_F(RecordingFiles, SplitsByTimeOfTheSamples) {
