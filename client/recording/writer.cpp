@@ -165,7 +165,7 @@ void Writer::begin_chunk() {
   disk_.notify_one();
 }
 
-// What is already encoded has the earlier descriptions, and comes into the file before.
+// What is already encoded has the earlier descriptions, and comes into the files before.
 void Writer::begin_described_file() {
   if (!open_->is_empty()) take_open_chunk();
   open_->begins_file = true;
@@ -391,10 +391,8 @@ Result<void> Writer::store(const Chunk& chunk) {
     channel.channel.schema_id = described.schema.id;
     set_type(channel.channel, described.type);
   }
-  if (chunk.begins_file || (!is_ending_file_ && is_file_full(chunk))) {
-    is_ending_file_ = false;
-    DSSM_TRY(begin_file());
-  }
+  if (chunk.begins_file || is_file_full(chunk)) DSSM_TRY(begin_file());
+  if (chunk.begins_file) is_ending_file_ = false;
   for (const NewChannel& channel : chunk.channels) {
     for (DiskStream& earlier : disk_streams_) {
       if (earlier.channel.channel.topic == channel.channel.topic) earlier.replaced = true;
@@ -425,8 +423,11 @@ Result<void> Writer::store(const Chunk& chunk) {
 
 bool Writer::is_file_full(const Chunk& chunk) const {
   if (current_.summary().chunks.empty()) return false;
-  if (options_.max_file_bytes > 0 && current_.bytes() >= options_.max_file_bytes) return true;
-  if (options_.max_file_duration == Duration::zero()) return false;
+  // Where little waits before a chunk with begins_file, that needs no file of its own.
+  const std::uint64_t more = is_ending_file_ ? options_.max_file_bytes / 8 : 0;
+  const std::uint64_t most = options_.max_file_bytes;
+  if (most > 0 && current_.bytes() >= most + more) return true;
+  if (options_.max_file_duration == Duration::zero() || is_ending_file_) return false;
   std::int64_t end_ns = file_start_ns_;
   for (const auto& part : std::span(chunk.parts).first(chunk.used_parts)) {
     end_ns = std::max(end_ns, part.part.max_time_ns);

@@ -71,11 +71,13 @@ struct RecordingOptions {
   std::uint64_t queue_bytes = 64U << 20;
   // A file that has so many bytes, or holds samples of so long a time, is followed by another one:
   // NAME.mcap, NAME_1.mcap, NAME_2.mcap ... A file may become longer than this by one chunk and its
-  // summary; before one with new descriptions of types, by what waits for the disk. 0: one file.
+  // summary. When add_stream() has described a type, what was written before still comes into files
+  // without that description, the last of which may also be an eighth larger, and have samples of a
+  // longer time, by what waited for the disk. 0: one file.
   std::uint64_t max_file_bytes = 0;
   Duration max_file_duration{};
   // Of all files of this recording: the oldest ones are deleted when there are more. Without
-  // max_file_bytes, a file then has an eighth of this. 0: no limit.
+  // max_file_bytes, that is an eighth of this then. 0: no limit.
   std::uint64_t max_total_bytes = 0;
 };
 
@@ -106,8 +108,8 @@ class RecordingWriter {
   ~RecordingWriter();
 
   // The number of the stream in this recording, for the other calls. The same stream (id and
-  // incarnation) again: the same number. A name or fields that its type lacked hold from the next
-  // file on then; what else `stream` has is ignored.
+  // incarnation) again: the same number. A name or fields that its type lacked hold then from the
+  // file on that begins after all that was written before; what else `stream` has is ignored.
   //   fails  invalid_argument (a name or type that is not allowed), limit_exceeded
   //          (more than 65,535 streams), and as write()
   Result<std::uint32_t> add_stream(const RecordedStream& stream);

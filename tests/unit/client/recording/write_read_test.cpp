@@ -306,6 +306,25 @@ TEST_F(RecordingFiles, HaveADescriptionFromTheNextFileOn) {
   EXPECT_EQ(all_of(recording), written);
 }
 
+// The disk is slower than the test, so nearly all waits for it when the description comes.
+TEST_F(RecordingFiles, StaySmallWhenMuchWaitsBeforeADescription) {
+  RecordingOptions options;
+  options.compression = Compression::none;
+  options.chunk_bytes = 500;
+  options.max_file_bytes = 4000;
+  RecordingWriter writer = RecordingWriter::create(path("a.mcap"), options).value();
+  RecordedStream about = plain_stream("s", 24);
+  const auto stream = writer.add_stream(about).value();
+  for (int i = 0; i < 600; ++i) write(writer, stream, sample_at(i, i));
+  about.type = {"Point", 24, 8, {{"x", Scalar::float64, 0, 1}, {"y", Scalar::float64, 8, 1}}};
+  EXPECT_EQ(writer.add_stream(about).value(), stream);
+  for (int i = 600; i < 1000; ++i) write(writer, stream, sample_at(i, i));
+  ASSERT_TRUE(writer.finish());
+  const Recording recording = open_recording(folder_);
+  EXPECT_EQ(all_of(recording).size(), 1000U);
+  for (const auto& file : recording.files()) EXPECT_LT(std::filesystem::file_size(file), 8000U);
+}
+
 TEST_F(RecordingFiles, HaveNoDescriptionThatCameAfterTheLastFileBegan) {
   RecordingWriter writer = RecordingWriter::create(path("a.mcap")).value();
   const auto bytes = writer.add_stream(plain_stream("bytes", 24)).value();
