@@ -91,12 +91,13 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
           {event.stream, is_new ? std::optional(kNoTid) : std::nullopt, MonoClock::now()});
     }
     if (known != known_.end()) {
-      std::uint64_t& incarnation = known->second.incarnation;
-      if (incarnation != event.stream.incarnation &&
-          !event.stream.type.check_usable_as(known->second.type)) {
+      auto& [incarnation, type] = known->second;
+      if (incarnation != event.stream.incarnation && !event.stream.type.check_usable_as(type)) {
         replaces = incarnation;
       } else {
         incarnation = event.stream.incarnation;
+        // The reader continues only with such ones then.
+        if (type.is_less_described_than(event.stream.type)) type = event.stream.type;
       }
     }
   }

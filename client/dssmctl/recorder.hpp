@@ -187,7 +187,8 @@ class Recorder {
       std::optional<std::uint64_t> replaces = {};
       bool is_opening = false;
     };
-    // What was opened last of a name, and the incarnation that its reader continues with.
+    // Of a name: the incarnation that was opened last or that its reader continues with, and the type
+    // that the next one needs for that.
     struct Known {
       std::uint64_t incarnation = 0;
       TypeInfo type;

@@ -78,6 +78,20 @@ TEST_F(RecorderOf, AStreamOfAnotherTypeLosesWhatItsRingOverwroteBeforeItWasOpene
   EXPECT_EQ(progress.samples + progress.lost_samples, 1000U);
 }
 
+// Its reader could have continued with any type of that size before it got a name.
+TEST_F(RecorderOf, AStreamThatGotANameForItsTypeIsOpenedAgainForAnother) {
+  RawWriter writer =
+      session_.create_raw({"again", 0, ""}, {"", sizeof(double), 1, {}}, depth_of(64)).value();
+  start(writer.id());
+  writer = replace<double>(1);
+  await([&] { return recorder_->take() && recorder_->progress().samples == 1; });
+  writer = replace<std::int64_t>(1000, 8);
+  await_opened(writer.id());
+  ASSERT_TRUE(recorder_->finish());
+  const RecordingProgress progress = recorder_->progress();
+  EXPECT_EQ(progress.samples + progress.lost_samples, 1001U);
+}
+
 struct RecordedVolts {
   double volts;
 };
