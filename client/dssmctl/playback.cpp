@@ -29,12 +29,14 @@ Result<void> check_is_own(Session& session) {
   const DaemonInfo daemon = DSSM_TRY(session.daemon_info());
   const std::string& driver = daemon.playback_driver;
   if (driver.empty()) return {};
-  const std::string host = driver.substr(driver.rfind('@') + 1);
+  const std::size_t at = driver.rfind('@');  // the name may be cut before it
+  const std::string where =
+      at == std::string::npos ? "its host" : "'" + escaped(driver.substr(at + 1)) + "'";
   return Error{Errc::conflict,
                fmt::format("change the playback clock of '{}': it follows '{}', which would "
-                           "undo the change within a second; use `dssmctl playback` on '{}', or "
+                           "undo the change within a second; use `dssmctl playback` on {}, or "
                            "end that program",
-                           escaped(daemon.host), escaped(driver), escaped(host))};
+                           escaped(daemon.host), escaped(driver), where)};
 }
 
 void change(PlaybackClock& clock, const PlaybackOptions& options) {
