@@ -109,7 +109,12 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
   std::erase_if(removed_, [&](const auto& entry) { return entry.first == event.stream.id; });
   if (event.kind == StreamEvent::Kind::removed) {
     described_.erase(name);
-    if (known_.contains(name)) removed_.emplace_back(event.stream.id, MonoClock::now());
+    const bool is_opening = std::ranges::any_of(wanted_, [&](const Wanted& wanted) {
+      return is_it(wanted) && wanted.is_opening;  // its reader may be there soon
+    });
+    if (known_.contains(name) || is_opening) {
+      removed_.emplace_back(event.stream.id, MonoClock::now());
+    }
     untried_ -= static_cast<std::size_t>(
         std::count_if(wanted_.begin(), wanted_.end(), [&](const Wanted& wanted) {
           return is_it(wanted) && wanted.from_start && !wanted.reported;
