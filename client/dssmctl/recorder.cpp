@@ -79,7 +79,7 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
   const std::lock_guard lock(mutex_);
   // It has another type than its reader can continue with. That is opened at once, and not when the
   // reader finds that out: until then the ring may be overwritten, or be removed, too.
-  std::optional<std::uint64_t> replaces;
+  std::optional<std::uint64_t> replaced_incarnation;
   if (event.kind == StreamEvent::Kind::added && wants(event.stream)) {
     const auto known = known_.find(name);
     if (event.property_set) {
@@ -93,7 +93,7 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
     if (known != known_.end()) {
       auto& [incarnation, type] = known->second;
       if (incarnation != event.stream.incarnation && !event.stream.type.check_usable_as(type)) {
-        replaces = incarnation;
+        replaced_incarnation = incarnation;
       } else {
         incarnation = event.stream.incarnation;
         // The reader continues only with such ones then.
@@ -105,37 +105,41 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
     described_[name] = {event.stream.incarnation, event.stream.type};
     newly_described_.push_back(event.stream.id);
   }
-  const auto is_it = [&](const Wanted& wanted) { return wanted.stream.id == event.stream.id; };
+  const auto is_same_stream = [&](const Wanted& wanted) {
+    return wanted.stream.id == event.stream.id;
+  };
   std::erase_if(removed_, [&](const auto& entry) { return entry.first == event.stream.id; });
   if (event.kind == StreamEvent::Kind::removed) {
     described_.erase(name);
     const bool is_opening = std::ranges::any_of(wanted_, [&](const Wanted& wanted) {
-      return is_it(wanted) && wanted.is_opening;  // its reader may be there soon
+      return is_same_stream(wanted) && wanted.is_opening;  // its reader may be there soon
     });
     if (known_.contains(name) || is_opening) {
       removed_.emplace_back(event.stream.id, MonoClock::now());
     }
     untried_ -= static_cast<std::size_t>(
         std::count_if(wanted_.begin(), wanted_.end(), [&](const Wanted& wanted) {
-          return is_it(wanted) && wanted.from_start && !wanted.reported;
+          return is_same_stream(wanted) && wanted.from_start && !wanted.reported;
         }));
     std::erase_if(wanted_, [&](const Wanted& wanted) {
-      if (!is_it(wanted)) return false;
+      if (!is_same_stream(wanted)) return false;
       if (!wanted.reported && !wanted.is_opening) notice_missed(wanted.stream.id);
       return true;
     });
     return;
   }
-  if (!wants(event.stream) || (known_.contains(name) && !replaces) ||
-      std::any_of(wanted_.begin(), wanted_.end(), is_it)) {
+  if (!wants(event.stream) || (known_.contains(name) && !replaced_incarnation) ||
+      std::any_of(wanted_.begin(), wanted_.end(), is_same_stream)) {
     return;
   }
   if (plan_.range && !is_beginning_) return;
   // One that fits since it was described was there, too.
   const bool was_there = is_beginning_ || event.described;
   untried_ += was_there;
-  if (replaces) notice_reopening(event.stream.id, "its samples are of another type now");
-  wanted_.push_back({event.stream, MonoClock::now(), was_there, false, replaces});
+  if (replaced_incarnation) {
+    notice_reopening(event.stream.id, "its samples are of another type now");
+  }
+  wanted_.push_back({event.stream, MonoClock::now(), was_there, false, replaced_incarnation});
   changed_.notify_one();
 }
 
@@ -186,7 +190,7 @@ void Recorder::Opener::fetch_property(std::unique_lock<std::mutex>& lock,
 std::vector<Recorder::Opener::Wanted>::iterator Recorder::Opener::next_wanted() {
   auto next = wanted_.end();
   for (auto wanted = wanted_.begin(); wanted != wanted_.end(); ++wanted) {
-    const bool is_recorded = wanted->from_start || wanted->replaces;
+    const bool is_recorded = wanted->from_start || wanted->replaced_incarnation;
     if (stop_at_ && (!is_recorded || wanted->reported)) continue;
     if (next == wanted_.end() || wanted->due < next->due) next = wanted;
   }
@@ -221,7 +225,7 @@ void Recorder::Opener::reopen(const RawReader& ended, const Error& error) {
   Wanted wanted;
   wanted.stream.id = id;
   wanted.due = MonoClock::now();
-  wanted.replaces = ended.incarnation();
+  wanted.replaced_incarnation = ended.incarnation();
   wanted_.push_back(std::move(wanted));
   changed_.notify_one();
 }
@@ -263,10 +267,10 @@ void Recorder::Opener::run() {
     const std::uint64_t incarnation = wanted.stream.incarnation;  // 0: not known
     if (entry != wanted_.end() && entry->stream.incarnation != incarnation) {
       const StreamInfo& next_one = entry->stream;
-      const bool is_taken = opened && (opened->reader.incarnation() == next_one.incarnation ||
-                                       next_one.type.check_usable_as(opened->reader.type()));
-      if (!is_taken) {  // that one has its turn
-        if (opened) entry->replaces = opened->reader.incarnation();
+      const bool is_opened = opened && (opened->reader.incarnation() == next_one.incarnation ||
+                                        next_one.type.check_usable_as(opened->reader.type()));
+      if (!is_opened) {  // that one has its turn
+        if (opened) entry->replaced_incarnation = opened->reader.incarnation();
         entry = wanted_.end();
       }
     }
@@ -332,7 +336,8 @@ Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
       source.until = plan_.range->last;
     }
     if (source.from) skip_to(source.reader, *source.from);
-    if (wanted.replaces && *wanted.replaces != source.reader.incarnation()) source.next = 0;
+    const std::uint64_t incarnation = source.reader.incarnation();
+    if (wanted.replaced_incarnation.value_or(incarnation) != incarnation) source.next = 0;
   }
   return source;
 }
@@ -474,7 +479,7 @@ Duration Recorder::next_period() {
 Result<void> Recorder::add(Source source) {
   period_ = kMinPeriod;  // how quickly its ring fills is not known yet
   // The reader of an earlier source may have gone there by itself.
-  if (is_double(source)) return {};
+  if (is_duplicate(source)) return {};
   Source& added = sources_.emplace_back(std::move(source));
   if (!is_recording_) return {};
   if (is_on_demand_) want_past(added);
@@ -584,11 +589,11 @@ void Recorder::follow_restart(Source& source) {
 
 void Recorder::on_restarted(Source& source) {
   source.property.clear();  // dssmd reports the one that it has
-  source.is_over = is_double(source);
+  source.is_over = is_duplicate(source);
   if (source.is_over) source.new_properties.clear();  // the other one has them
 }
 
-bool Recorder::is_double(const Source& source) const {
+bool Recorder::is_duplicate(const Source& source) const {
   return std::ranges::any_of(sources_, [&](const Source& other) {
     return &other != &source && other.reader.id() == source.reader.id() &&
            other.reader.incarnation() == source.reader.incarnation();
@@ -723,13 +728,13 @@ bool Recorder::is_past_late() {
 }
 
 bool Recorder::has_past() const {
-  const auto is_taken = [](const Source& source) {
+  const auto has_its_past = [](const Source& source) {
     if (source.next > source.past_until) return true;
     SampleInfo info;
     const ReadStatus status = source.reader.read_info(source.past_until, info);
     return status == ReadStatus::lost || status == ReadStatus::too_old;
   };
-  return opener_.has_tried_all() && std::all_of(sources_.begin(), sources_.end(), is_taken);
+  return opener_.has_tried_all() && std::all_of(sources_.begin(), sources_.end(), has_its_past);
 }
 
 std::vector<std::string> Recorder::streams_without_fields() const {

@@ -184,11 +184,11 @@ class Recorder {
       bool from_start = false;  // it was there at begin()
       bool reported = false;
       // The incarnation before, which was opened: all samples of this one are wanted.
-      std::optional<std::uint64_t> replaces = {};
+      std::optional<std::uint64_t> replaced_incarnation = {};
       bool is_opening = false;
     };
-    // Of a name: the incarnation that was opened last or that its reader continues with, and the type
-    // that the next one needs for that.
+    // Of a name: the incarnation that was opened last or that its reader continues with, and the
+    // type that the next one needs for that.
     struct Known {
       std::uint64_t incarnation = 0;
       TypeInfo type;
@@ -270,7 +270,7 @@ class Recorder {
   // To be called when the reader has gone to another ring.
   void on_restarted(Source& source);
   // Whether another source has the same ring.
-  bool is_double(const Source& source) const;
+  bool is_duplicate(const Source& source) const;
   // Marks those whose readers cannot continue; their streams are opened again.
   void end_sources();
   void drop_ended();
