@@ -387,9 +387,9 @@ def expect_true(truth: Truth) -> None:
 
 
 def is_slewed(truth: Truth, checked: Checked) -> bool:
-    """Whether one of both clocks may still be slewed after it was set."""
+    """Whether one of both clocks may still be slewed: after it was set, or the reference that it follows."""
     return any(0 <= checked.came - step < RECOVERY_SECONDS * SECOND_NS / 2
-               for name in (checked.reader, checked.owner) for step in truth.watched[name].steps)
+               for watched in truth.watched.values() for step in watched.steps)
 
 
 def spread(values_ns: Iterable[float]) -> str:
