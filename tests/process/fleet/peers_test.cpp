@@ -142,7 +142,8 @@ TEST(FleetPeers, AreOneHostAtTwoAddresses) {
   const auto first = [&] { return peer_at(on1, pc2.addresses()[0]); };
   const auto second = [&] { return peer_at(on1, pc2.addresses()[1]); };
   await([&] { return first().state == HostState::up && second().state == HostState::up; });
-  EXPECT_EQ(first().streams + second().streams, 1u);
+  // Not at once: the connection that was there later may take over meanwhile.
+  await([&] { return first().streams + second().streams == 1u; });
   EXPECT_NE((first().error + second().error).find("same host as '127.0.0."), std::string::npos);
   EXPECT_TRUE(on1.open_reader<double>("lidar@pc2"));
 }
