@@ -236,7 +236,7 @@ void Connection::serve_frames() {
       readable_.disable();
       return turn_.wait(waits_for_);
     }
-    // The events that its requests cause have a turn of their own; the next requests go on.
+    // Events that its requests cause wait for a turn of their own; its next requests do not.
     const bool got_events = !turn_.is_waiting() && service_.go_on(number_);
     waits_for_ = got_events ? TurnQueue::Reason::event : TurnQueue::Reason::request;
     if (got_events || !is_open()) continue;

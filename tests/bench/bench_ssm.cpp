@@ -45,7 +45,7 @@ void small() {
                target);
   };
   row("write(time)", "<= 2.0", write);
-  row("write()", "<= 3.0", [&] { check(writer.write()); });
+  row("write()", "<= 2.0", [&] { check(writer.write()); });
   for (int i = 0; i < 2 * kDepth; ++i) write();
   row("readLast()", "<= 1.0", [&] { check(reader.readLast()); });
   row("readNew(), nothing new", "<= 1.0", [&] { check(!reader.readNew()); });

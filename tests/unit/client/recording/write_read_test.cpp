@@ -229,12 +229,16 @@ TEST_F(RecordingFiles, ReadsIncarnationsInBothDirections) {
                                             "9:0", "too_old"}));
 }
 
-TEST_F(RecordingFiles, SplitsBySizeAndOpensTheFolderAsOne) {
+RecordingOptions small_files() {
   RecordingOptions options;
   options.compression = Compression::none;
   options.chunk_bytes = 500;
   options.max_file_bytes = 4000;
-  RecordingWriter writer = RecordingWriter::create(path("a.mcap"), options).value();
+  return options;
+}
+
+TEST_F(RecordingFiles, SplitsBySizeAndOpensTheFolderAsOne) {
+  RecordingWriter writer = RecordingWriter::create(path("a.mcap"), small_files()).value();
   const auto stream = writer.add_stream(plain_stream("s", 24)).value();
   const auto restarted = writer.add_stream(plain_stream("s", 24, 2)).value();
   ASSERT_TRUE(writer.set_property(stream, payload_of(1, 5)));
@@ -308,11 +312,7 @@ TEST_F(RecordingFiles, HaveADescriptionFromTheNextFileOn) {
 
 // The disk is slower than the test, so nearly all waits for it when the description comes.
 TEST_F(RecordingFiles, StaySmallWhenMuchWaitsBeforeADescription) {
-  RecordingOptions options;
-  options.compression = Compression::none;
-  options.chunk_bytes = 500;
-  options.max_file_bytes = 4000;
-  RecordingWriter writer = RecordingWriter::create(path("a.mcap"), options).value();
+  RecordingWriter writer = RecordingWriter::create(path("a.mcap"), small_files()).value();
   RecordedStream about = plain_stream("s", 24);
   const auto stream = writer.add_stream(about).value();
   for (int i = 0; i < 600; ++i) write(writer, stream, sample_at(i, i));
