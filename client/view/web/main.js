@@ -125,9 +125,13 @@ function oldestOf(stream) {
   if (!stream?.oldest_ns) return null;
   const oldest = BigInt(stream.oldest_ns);
   if (stream.state !== "live" || stream.oldest_tid === 0) return oldest;
-  const part = (BigInt(stream.newest_ns) - oldest) / 10n;
   const sinceNs = BigInt(Math.round((performance.now() - overviewAt) * 1e6));
-  return oldest + sinceNs + (part < kMaxMarginNs ? part : kMaxMarginNs);
+  return oldest + sinceNs + marginOf(BigInt(stream.newest_ns) - oldest);
+}
+
+function marginOf(lengthNs) {
+  const part = lengthNs / 10n;
+  return part < kMaxMarginNs ? part : kMaxMarginNs;
 }
 
 // The oldest instant at which a stream that is shown has a sample. A recording is shown from its
@@ -278,6 +282,10 @@ const atPump = new Pump(connection, kAtMs, async () => {
     if (at !== null) time.setShown(at);
   }
   const has = (status) => answer.head.samples.some((one) => one.status === status);
+  if (time.mode === "play" && !time.recorded && has("too_old") && !has("ok")) {
+    // The rings lose their samples as fast as they are played here, or faster.
+    time.skip(marginOf(time.range.newest - time.t));
+  }
   if (has("opening") || has("restarted")) return kOpeningMs;
   if (time.mode !== "hold" && time.hover === null) return 0;
   return has("arriving") || has("not_yet") || has("lapped") ? kArrivingMs : null;

@@ -72,6 +72,11 @@ export class Time extends EventTarget {
     }, kPlayMs);
   }
 
+  // Goes on playing `ns` later.
+  skip(ns) {
+    this.set("play", this.t + ns);
+  }
+
   toggle() {
     if (this.mode !== "hold") this.hold();
     else if (this.recorded) this.play();

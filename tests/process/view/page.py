@@ -309,7 +309,8 @@ def oldest(page, stream, oldest_ns, second_ns):
 
 
 def oldest_live(page, stream):
-    """Of a ring that loses its oldest samples meanwhile, Home and Play begin where some are left."""
+    """Of a ring that loses its oldest samples meanwhile, Home and Play begin where some are left,
+    and Play goes on where some are left."""
     page.open("views", views=[{"stream": stream}])
     page.wait("the ring is full", lambda: int(page.get(card(stream), "data-tid") or 0) > 400)
     first = int(page.get("#time", "data-oldest-ns"))
@@ -332,6 +333,10 @@ def oldest_live(page, stream):
     page.wait("it plays", lambda: page.get("#time", "data-mode") == "play")
     first = page.wait("a sample", lambda: page.get(card(stream), "data-tid"))
     page.wait("later ones", lambda: int(page.get(card(stream), "data-tid") or 0) > int(first) + 20)
+    page.choose("#rate", "0.1")
+    page.wait("samples that were not there at first",
+              lambda: int(page.get(card(stream), "data-tid") or 0) > int(first) + 400)
+    assert page.get("#time", "data-mode") == "play"
 
 
 def absent(page, early, late, image):
