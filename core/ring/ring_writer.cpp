@@ -59,7 +59,7 @@ Tid RingWriter::commit(std::size_t payload_bytes, Time time, Duration clock_erro
   // No fence: glibc's memcpy ends its non-temporal stores with one, and a program that uses such
   // stores directly must end them with one, as before any other release.
   const Tid tid = newest() + 1;
-  slots_.publish({tid, time, clock_error, payload_bytes});
+  slots_.publish_before_unlock({tid, time, clock_error, payload_bytes});
   loaned_rings.remove(&slots_.header());
   lock_->unlock();
   follow_up(tid);
@@ -85,7 +85,7 @@ Tid RingWriter::try_publish(const PublishedSample& sample, std::span<const std::
   const Tid tid = newest() + 1;
   slots_.begin(tid);
   slots_.fill(tid, payload);
-  slots_.publish({tid, time, clock_error, payload.size()});
+  slots_.publish_before_unlock({tid, time, clock_error, payload.size()});
   lock_->unlock();
   follow_up(tid);
   return tid;

@@ -29,8 +29,8 @@ SlotWriter::SlotWriter(const RingMapping& mapping) noexcept
   fence_after_filling(large_);
 }
 
-[[gnu::hot]] void SlotWriter::publish(Tid tid, Time time, Duration clock_error,
-                                      std::uint64_t bytes) const noexcept {
+[[gnu::hot]] void SlotWriter::finish(Tid tid, Time time, Duration clock_error,
+                                     std::uint64_t bytes) const noexcept {
   const Tid top = header_->top.load(std::memory_order_relaxed);
   const std::int64_t time_ns = to_ns(time);
   Tid run_start = header_->run_start.load(std::memory_order_relaxed);
@@ -52,9 +52,6 @@ SlotWriter::SlotWriter(const RingMapping& mapping) noexcept
   store({tid, time, clock_error, bytes}, run_start);
   // Even: the sample is complete. Pairs with the first load of each read.
   slots_.slot(tid).sequence.store(published_sequence(tid), std::memory_order_release);
-  // Sequentially consistent, like the bell's loads that follow: either a sleeper that has just
-  // announced itself sees this top, or the writer sees the announcement.
-  header_->top.store(tid, std::memory_order_seq_cst);
 }
 
 [[gnu::always_inline]] inline void SlotWriter::store(const SampleInfo& info,
