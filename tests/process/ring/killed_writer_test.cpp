@@ -23,8 +23,8 @@ constexpr std::size_t kPayloadBytes = 64;
 // A sanitizer multiplies instructions and the cost of a fork: it gets a sample of them.
 #if defined(DSSM_TSAN) || defined(__SANITIZE_ADDRESS__)
 constexpr bool kSanitized = true;
-constexpr int kStride = 197;
-constexpr int kPublishingStride = 991;
+constexpr int kStride = 997;
+constexpr int kPublishingStride = 1999;
 constexpr int kRounds = 50;
 #else
 constexpr bool kSanitized = false;
