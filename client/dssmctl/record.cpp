@@ -126,10 +126,11 @@ class RecordingRun {
   void report_undescribed() {
     const std::vector<std::string> names = recorder_.streams_without_fields();
     if (names.empty()) return;
+    constexpr std::size_t kMaxNamed = 20;
     notice(
         fmt::format("without descriptions, so only with their bytes: {}; `dssmctl describe "
                     "STREAM` before a recording gives a stream fields",
-                    list_text(names)));
+                    list_text(names, kMaxNamed)));
   }
 
   void notice(const std::string& text) {
