@@ -44,8 +44,9 @@ struct ClockLine {
   // A line through `reading`.
   static ClockLine through(const ClockReading& reading, PartsPerBillion rate) noexcept;
   // The line through `reading` that follows `line`. Its rate is what the wall clock gained since
-  // `rate_from`, which becomes `reading`. While these two are too close together (kExactness), the
-  // rate is that of `line`, and `rate_from` stays.
+  // `rate_from`, which becomes `reading`. While these two are too close together (kExactness), and
+  // if the wall clock seems to be on `line`, so that reading the clocks only takes longer or less
+  // than then, the rate is that of `line`, and `rate_from` stays.
   static ClockLine after(const ClockLine& line, ClockReading& rate_from,
                          const ClockReading& reading) noexcept;
 
@@ -59,10 +60,12 @@ struct ClockLine {
   // which is this PC's, allows, and never too early. `now` if the line does not show it, because
   // the clock was set or slewed since then, or there is no stamp.
   RawTime arrival(std::optional<Time> arrived, RawTime now) const noexcept;
+  // Whether all that this line allows is allowed by `other`, too, for ever.
+  bool is_within(const ClockLine& other) const noexcept;
   // Whether `reading` proves that the wall clock was on the line.
   bool shows(const ClockReading& reading) const noexcept;
   // Whether this PC's wall clock is on the line, which is its own. Three clocks are read; up to
-  // five times as many if it is not.
+  // ten times as many if it is not.
   bool holds() const noexcept;
 
   friend bool operator==(const ClockLine& a, const ClockLine& b) = default;

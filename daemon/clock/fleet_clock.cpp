@@ -75,7 +75,7 @@ bool is_good(ClockStatus status) noexcept {
 // Whether other hosts have to know of the change before they get another sample.
 bool is_new_generation(const wire::ClockReport& before, const wire::ClockReport& after) {
   return before.clock.status != after.clock.status || before.has_bound() != after.has_bound() ||
-         before.anchor != after.anchor || before.line != after.line ||
+         before.anchor != after.anchor || !after.line.is_within(before.line) ||
          before.setting != after.setting || before.settled_from != after.settled_from ||
          before.corrected != after.corrected;
 }
@@ -346,8 +346,14 @@ void FleetClock::update_setting(const clock::Instant& now) {
 void FleetClock::update_line(RawTime now) {
   wire::ClockReport& own = *own_;
   clock::ClockLine& line = own.line;
-  if (line.holds() && now - line.raw < kLineAge) return;
   const clock::ClockReading reading = clock::ClockReading::now();
+  if (line.holds() && now - line.raw < kLineAge) {
+    // One that was drawn while reading the clocks took long would stay all the longer. Other hosts
+    // get the better one with the next heartbeat: the one that they have holds as well.
+    const clock::ClockLine better = clock::ClockLine::through(reading, line.rate);
+    if (better.tolerance < line.tolerance * 3 / 4 && better.is_within(line)) line = better;
+    return;
+  }
   if (!line.exists()) rate_from_ = reading;
   line = clock::ClockLine::after(line, rate_from_, reading);
   watch_.poll_now();

@@ -49,6 +49,19 @@ TEST(ClockLine, ShowsOnlyWhatIsCertain) {
   EXPECT_FALSE(line.shows({kStart + 2h, kWall + 2h, 4us})) << "it is too old";
 }
 
+TEST(ClockLine, IsWithinOneThatAllowsMore) {
+  const ClockLine line{kStart, kWall, 20'000, 30us};
+  EXPECT_TRUE(line.is_within(line));
+  EXPECT_TRUE((ClockLine{kStart + 1s, kWall + 1s + 40us, 20'000, 10us}.is_within(line)));
+  EXPECT_TRUE((ClockLine{kStart + 1s, kWall + 1s, 20'000, 10us}.is_within(line)));
+  EXPECT_FALSE((ClockLine{kStart + 1s, kWall + 1s + 41us, 20'000, 10us}.is_within(line)));
+  EXPECT_FALSE((ClockLine{kStart + 1s, kWall + 1s - 1us, 20'000, 10us}.is_within(line)));
+  EXPECT_FALSE((ClockLine{kStart + 1s, kWall + 1s + 20us, 20'001, 10us}.is_within(line)))
+      << "it leaves it later";
+  EXPECT_FALSE(line.is_within(ClockLine()));
+  EXPECT_FALSE(ClockLine().is_within({kStart, kWall, 0, 30us})) << "there is none any more";
+}
+
 TEST(ClockLine, TakesItsRateFromReadingsThatAreFarEnoughApart) {
   ClockReading from{kStart, kWall, 5us};
   ClockLine line = ClockLine::through(from, 100);
@@ -59,15 +72,28 @@ TEST(ClockLine, TakesItsRateFromReadingsThatAreFarEnoughApart) {
   EXPECT_EQ(line.wall, soon.wall);
   EXPECT_EQ(line.rate, 100);
   EXPECT_EQ(from.raw, kStart) << "so that many that follow each other get a rate at last";
-  const ClockReading later{kStart + 20ms, kWall + 21ms, 5us};
+  const ClockReading later{kStart + 20ms, kWall + 22ms, 5us};
   line = ClockLine::after(line, from, later);
   EXPECT_EQ(line.wall, later.wall);
-  EXPECT_EQ(line.rate, 50'000'000);
+  EXPECT_EQ(line.rate, 100'000'000);
   EXPECT_EQ(from.raw, later.raw);
   line = ClockLine::after(line, from, {later.raw + 6ms, later.wall + 6ms, 1us});
-  EXPECT_EQ(line.rate, 50'000'000);
+  EXPECT_EQ(line.rate, 100'000'000);
   line = ClockLine::after(line, from, {kStart + 1s, kWall + 10s, 5us});
   EXPECT_EQ(line.rate, ClockLine::kMaxRate) << "faster than any clock";
+}
+
+// One that is replaced because reading the clocks takes longer or less. Its rate is better known.
+TEST(ClockLine, KeepsItsRateWhileItIsRight) {
+  const ClockReading first{kStart, kWall, 5us};
+  ClockReading from = first;
+  const ClockLine line = ClockLine::through(from, 20'000);
+  const ClockReading slow{kStart + 1s, kWall + 1s + 24us, 30us};
+  const ClockLine next = ClockLine::after(line, from, slow);
+  EXPECT_EQ(next.raw, slow.raw);
+  EXPECT_EQ(next.rate, 20'000);
+  EXPECT_EQ(from.raw, first.raw);
+  EXPECT_EQ(ClockLine::after(line, from, {kStart + 1s, kWall + 1s + 25us, 5us}).rate, 25'000);
 }
 
 // Bytes that came 5 ms ago.
