@@ -183,12 +183,14 @@ void PeerConnection::start_heartbeat() {
 
 void PeerConnection::on_their_heartbeat() {
   their_beat_at_ = loop_.now();
-  if (beat_at_ != MonoTime() && their_beat_at_ - beat_at_ >= wire::kHeartbeat / 2) beat(true);
+  if (beat_at_ == MonoTime() || their_beat_at_ - beat_at_ < wire::kHeartbeat / 2) return;
+  follows_theirs_ = true;
+  heartbeat_.enable_in(Duration::zero());  // after theirs was answered
 }
 
 // Called every kHeartbeat, or when the peer timeout is over, whichever is first. This is where a
 // peer that does not answer any more counts as dead (peers.hpp).
-void PeerConnection::beat(bool follows_theirs) {
+void PeerConnection::beat() {
   FrameConnection* link = dialer_.connection();
   if (!link) return;
   const MonoTime now = loop_.now();
@@ -201,9 +203,10 @@ void PeerConnection::beat(bool follows_theirs) {
                      std::chrono::duration_cast<std::chrono::milliseconds>(silent).count())});
   }
   beat_at_ = now;
-  follows_theirs_ = follows_theirs;
+  is_repeatable_ = !follows_theirs_;
   ping();
-  heartbeat_.enable_in(std::min(wire::kHeartbeat, timeout - silent));
+  const Duration next = std::exchange(follows_theirs_, false) ? kFollow : wire::kHeartbeat;
+  heartbeat_.enable_in(std::min(next, timeout - silent));
 }
 
 void PeerConnection::ping() {
@@ -240,8 +243,8 @@ void PeerConnection::on_pong(MonoTime asked, RawTime asked_raw, const Result<net
   const MonoTime now = loop_.now();
   const bool do_they_beat = now - their_beat_at_ <= wire::kHeartbeat * 3 / 2;
   const bool is_late = took > round_trips_.min * 5 / 4;
-  if (do_they_beat && !follows_theirs_ && is_late && now - repeated_at_ >= kRepeat &&
-      dialer_.connection()) {
+  if (std::exchange(is_repeatable_, false) && do_they_beat && is_late &&
+      now - repeated_at_ >= kRepeat && dialer_.connection()) {
     repeated_at_ = now;
     ping();
   }

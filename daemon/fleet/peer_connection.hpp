@@ -27,7 +27,9 @@ class PeerConnection final : private Dialer::Observer {
   static constexpr std::size_t kMaxWaitingBytes = 3U << 20;  // two properties of the largest size
 
   // Between two heartbeats that are repeated.
-  static constexpr Duration kRepeat = wire::kHeartbeat * 7 / 2;
+  static constexpr Duration kRepeat = wire::kHeartbeat * 3 / 2;
+  // After a heartbeat that followed one of the peer: until then the next one of the peer comes.
+  static constexpr Duration kFollow = wire::kHeartbeat * 9 / 8;
 
   // A found host that answers again is back within kFoundRoundTime + ConnectPlan::kMaxPause,
   // whichever of its addresses are dead; the design allows 3 s.
@@ -76,9 +78,10 @@ class PeerConnection final : private Dialer::Observer {
   // Sends a heartbeat each second, and closes the connection when the peer is dead: see beat().
   void start_heartbeat();
   // A heartbeat of the peer came. Both PCs are awake now, so this host sends its own at once, if
-  // its last one was at least half a second ago: it is answered sooner than at other times.
-  // A heartbeat that was sent at another time, and was answered late, is repeated once; this is
-  // done for one of four at most, so that both PCs do not wake up much more often.
+  // its last one was at least half a second ago: it is answered sooner than at other times, and
+  // this host need not wake up for it. So one of the two hosts begins, always the same one. If its
+  // heartbeat is answered late, it is repeated once, while both are awake; this is done for one of
+  // two at most, so that both PCs do not wake up much more often.
   void on_their_heartbeat();
 
   // Closes the connection and dials again later.
@@ -138,7 +141,7 @@ class PeerConnection final : private Dialer::Observer {
   void on_up(FrameConnection& link, const wire::Greeting& them) override;
   Result<void> on_frame(net::Frame& frame) override;
   void on_down(const Error& error) override;
-  void beat(bool follows_theirs = false);
+  void beat();
   void ping();
   void take_clock(std::shared_ptr<const wire::ClockReport> clock);
   void on_pong(MonoTime asked, RawTime asked_raw, const Result<net::Frame>& answer);
@@ -157,7 +160,8 @@ class PeerConnection final : private Dialer::Observer {
   std::optional<wire::Greeting> them_;
   RoundTrips round_trips_;
   MonoTime beat_at_{}, their_beat_at_{}, repeated_at_{};
-  bool follows_theirs_ = false;   // the last heartbeat
+  bool follows_theirs_ = false;   // the next heartbeat
+  bool is_repeatable_ = false;    // the last heartbeat
   RawTime asked_{}, answered_{};  // the last heartbeat; answered_ 0: not yet
   std::uint64_t carried_bytes_per_s_ = 0;
   bool watching_ = false;

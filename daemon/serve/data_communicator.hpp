@@ -101,7 +101,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
     virtual void on_ended(DataCommunicator& communicator) = 0;
     // The peer has sent its Hello.
     virtual void on_greeted(DataCommunicator& /*communicator*/) {}
-    // A heartbeat arrived, and was answered.
+    // A heartbeat arrived; it is answered afterwards.
     //   returned  when this host's answer to the heartbeat before left and came there, and when
     //             this heartbeat left there and came; nullopt: not known. Untrusted
     virtual void on_heartbeat(const wire::Greeting& /*them*/,

@@ -446,9 +446,11 @@ TEST(DataCommunicator, SaysWhenAPingArrivedAndWhenItWasAnswered) {
 TEST(DataCommunicator, ReportsWhatTheHeartbeatsOfAPeerSayOfTheClocks) {
   std::vector<std::optional<clock::HeartbeatTimes>> reported;
   std::string host;
+  RawTime reported_at;
   ServerRig rig;
   rig.on_heartbeat = [&](const wire::Greeting& them, const auto& returned) {
     host = them.host;
+    reported_at = RawClock::now();
     reported.push_back(returned);
   };
   MemoryPeer peer;
@@ -473,6 +475,8 @@ TEST(DataCommunicator, ReportsWhatTheHeartbeatsOfAPeerSayOfTheClocks) {
   EXPECT_EQ(to_ns(reported[2]->sent), 3000);
   EXPECT_EQ(to_ns(reported[2]->answered), last.received_ns());
   EXPECT_FALSE(reported[3]);
+  const net::Pong answer = ping(7, 5000, 0);
+  EXPECT_GE(answer.raw_ns(), to_ns(reported_at)) << "answering is the last thing to do";
 }
 
 // One with a channel, or with heartbeats, stays.
