@@ -20,8 +20,7 @@ std::size_t HistoryPace::allowance(MonoTime now, const Connection& connection) {
   } else if (state_ == State::measuring) {
     go_on_measuring(now, connection);
   }
-  if (state_ == State::measuring) return allowance_while_measuring(now, connection);
-  if (state_ == State::unlimited) return kUnlimited;
+  if (state_ != State::paced) return kUnlimited;
   const double missing = piece_bytes() - tokens_;
   if (missing <= 0) return static_cast<std::size_t>(tokens_);
   const double wait_s = std::min(missing / (kShare * bytes_per_s_), seconds(kPeriod));
@@ -66,7 +65,6 @@ void HistoryPace::measure(MonoTime now, const Connection& connection) {
   begun_ = now;
   windows_ = flat_windows_ = void_windows_ = 0;
   last_bytes_per_s_ = 0;
-  most_waiting_bytes_ = kFirstWaitingBytes;
   if (!progress) return set_rate(now, kFastBytesPerS, 0);
   state_ = State::measuring;
   begin_window(now, connection, *progress);
@@ -83,15 +81,13 @@ void HistoryPace::begin_window(MonoTime now, const Connection& connection,
              false,
              sent_bytes_,
              connection.sent_bytes,
-             progress,
-             0};
+             progress};
 }
 
 void HistoryPace::go_on_measuring(MonoTime now, const Connection& connection) {
   // It has no more history, or the network is interrupted.
   if (now - window_.heard > kMaxWindow) return measure(now, connection);
   if (window_.connection != connection.id) return;
-  if (connection.sent_bytes + kMinPieceBytes > window_.may_have_sent_bytes) window_.is_full = true;
   if (std::exchange(window_.is_full, false)) window_.full_for += now - window_.heard;
   window_.heard = now;
   if (now >= window_.end) end_window(now, connection);
@@ -123,26 +119,9 @@ void HistoryPace::end_window(MonoTime now, const Connection& connection) {
   if (is_last_window()) {
     return set_rate(now, is_receivers ? kFastBytesPerS : bytes_per_s, progress->waiting_bytes);
   }
-  const bool has_grown = bytes_per_s >= kGrows * last_bytes_per_s_;
-  flat_windows_ = has_grown ? 0 : flat_windows_ + 1;
-  if (has_grown) most_waiting_bytes_ *= 2;
+  flat_windows_ = bytes_per_s < kGrows * last_bytes_per_s_ ? flat_windows_ + 1 : 0;
   last_bytes_per_s_ = bytes_per_s;
   begin_window(now, connection, *progress);
-}
-
-// Of the measured connection. The others may send what they have: they are few, and short.
-std::size_t HistoryPace::allowance_while_measuring(MonoTime now, const Connection& connection) {
-  if (window_.connection != connection.id) return kUnlimited;
-  const std::optional<wire::Progress> progress = connection.transport.progress();
-  if (!progress) return kUnlimited;
-  const std::uint64_t waiting = std::min(progress->waiting_bytes, most_waiting_bytes_);
-  std::uint64_t allowed = most_waiting_bytes_ - waiting;
-  if (allowed < kMinPieceBytes) {
-    allowed = 0;
-    due_ = now + kPiece;
-  }
-  window_.may_have_sent_bytes = connection.sent_bytes + allowed;
-  return allowed;
 }
 
 void HistoryPace::set_rate(MonoTime now, double bytes_per_s, std::uint64_t waiting_bytes) noexcept {

@@ -6,12 +6,10 @@
 // more than a queue adds. A new sample still waits behind the history sample that is begun on its
 // own connection, and while the network is measured:
 //
-//   measuring  history is sent as fast as the connection takes it, but with few bytes on their
-//              way at first, and with twice as many after each window that carried more: what is
-//              on its way waits in the network. Short windows until two in a row carry no more
-//              than the one before: TCP is up to speed, and buffers that let the first bytes pass
-//              faster are full. What is delivered in one more, kLastWindows times as long, is what
-//              the network carries
+//   measuring  history is sent as fast as the connection takes it. Short windows until two in a
+//              row carry no more than the one before: TCP is up to speed, and buffers that let
+//              the first bytes pass faster are full. What is delivered in one more, kLastWindows
+//              times as long, is what the network carries
 //   paced      history gets kShare of that, without what live samples take of it, but at least
 //              kLeastShare. Measured again after kMinValid to kMaxValid, and when a connection has
 //              not taken what it was allowed to for kTooFull of kPeriod
@@ -39,8 +37,6 @@ class HistoryPace {
   static constexpr Duration kMaxWindow = std::chrono::seconds(1);
   static constexpr double kGrows = 1.25;  // a window that carries so much more than the one before
   static constexpr int kMaxWindows = 100, kLastWindows = 3;
-  // On their way in the first window, at most; looked at again after kPiece.
-  static constexpr std::uint64_t kFirstWaitingBytes = 64U << 10;
   // In which the connection was not full half of the time. Once full it counts so until there is
   // history again, but no longer than the kernel says that some had not arrived yet.
   static constexpr int kMaxVoidWindows = 20;
@@ -95,7 +91,6 @@ class HistoryPace {
     bool is_full = false;  // since `heard`
     std::uint64_t sent_bytes = 0, sent_by_it_bytes = 0;
     wire::Progress progress;
-    std::uint64_t may_have_sent_bytes = 0;  // by that connection
   };
 
   void measure(MonoTime now, const Connection& connection);
@@ -103,7 +98,6 @@ class HistoryPace {
   void begin_window(MonoTime now, const Connection& connection, const wire::Progress& progress);
   bool is_last_window() const noexcept { return flat_windows_ == 2 || windows_ == kMaxWindows; }
   void end_window(MonoTime now, const Connection& connection);
-  std::size_t allowance_while_measuring(MonoTime now, const Connection& connection);
   void set_rate(MonoTime now, double bytes_per_s, std::uint64_t waiting_bytes) noexcept;
   void refill(MonoTime now) noexcept;
   bool is_valid(MonoTime now) noexcept;
@@ -115,7 +109,6 @@ class HistoryPace {
   MonoTime valid_until_{};  // what was found
   Window window_;
   int windows_ = 0, flat_windows_ = 0, void_windows_ = 0;
-  std::uint64_t most_waiting_bytes_ = 0;  // of the connection that is measured
   double last_bytes_per_s_ = 0, bytes_per_s_ = 0;
   double tokens_ = 0;  // bytes of history that may be sent; < 0 after more
   MonoTime refilled_{}, due_{};

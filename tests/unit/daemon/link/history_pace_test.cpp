@@ -38,8 +38,7 @@ class Network final : public wire::Transport {
   double bytes_per_s;
   double live_bytes_per_s = 0;          // of other connections
   double most_per_tick = kBufferBytes;  // of TCP that is not up to speed yet
-  double queued_bytes = 0, most_queued_bytes = 0;
-  double burst_bytes = 0;     // that pass at once
+  double queued_bytes = 0;
   bool is_receivers = false;  // what limits
   bool is_full = true;        // else it is this PC
   Duration round_trip = 100us, queue_time{};
@@ -79,12 +78,8 @@ class Network final : public wire::Transport {
       pace_.on_full(this);
     }
     queued_bytes += history;
-    const double burst = std::min(queued_bytes, burst_bytes);
-    burst_bytes -= burst;
-    const double carried =
-        std::min(queued_bytes, burst + std::max(0.0, per_tick(bytes_per_s) - live));
+    const double carried = std::min(queued_bytes, std::max(0.0, per_tick(bytes_per_s) - live));
     queued_bytes -= carried;
-    most_queued_bytes = std::max(most_queued_bytes, queued_bytes);
     delivered_bytes_ += carried;
     if (queued_bytes + carried > 0) sending_ += kTick;
     return history;
@@ -153,16 +148,6 @@ TEST(HistoryPace, WaitsUntilTcpIsUpToSpeed) {
   EXPECT_GE(network.run(1s), 0.9 * HistoryPace::kShare * 100e6);
 }
 
-// What is sent to measure a slow network makes new samples wait in it.
-TEST(HistoryPace, SendsLittleToMeasureASlowNetwork) {
-  HistoryPace pace;
-  Network network(pace, 1e6);
-  network.burst_bytes = 256 << 10;
-  network.run(250ms);
-  EXPECT_NEAR(network.carried_bytes_per_s(), 1e6, 0.1e6);
-  EXPECT_LE(network.most_queued_bytes, 2 * HistoryPace::kFirstWaitingBytes);
-}
-
 // It is measured, and history is sent as fast as it goes.
 void expect_left_alone(Network& network) {
   network.run(1s);
@@ -189,7 +174,6 @@ TEST(HistoryPace, LeavesSlowReceiversAlone) {
 TEST(HistoryPace, LeavesSlowSendersAlone) {
   HistoryPace pace;
   Network network(pace, 20e6);
-  network.most_per_tick = per_tick(network.bytes_per_s);
   network.is_full = false;
   expect_left_alone(network);
 }
