@@ -102,7 +102,7 @@ inline void fence_after_copying_out() noexcept {
 }
 
 // A search loads many entries of the time index, then passes one fence before it loads `top` again.
-// Pairs with the release store to the index in SlotWriter::publish().
+// Pairs with the release store to the index in SlotWriter::store().
 inline constexpr std::memory_order kProbe = std::memory_order_relaxed;
 inline void fence_after_probing() noexcept { std::atomic_thread_fence(std::memory_order_acquire); }
 

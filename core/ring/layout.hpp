@@ -71,7 +71,7 @@ static_assert(sizeof(PublisherCursor) == 40);
 //   192   256 reserved         -      -           zero
 //   448     4 doorbell_armed   -      dssmd       seq_cst; not 0: writers ring their doorbells
 //   452    60 reserved         -      -           zero
-//   512     8 top              tid    writer      seq_cst after the sample; -1: nothing written
+//   512     8 top              tid    writer      after the sample; -1: none written
 //   520     8 run_start        tid    writer      before top; see "Search by time"
 //   528     8 first            tid    dssmd       before top; see "Window"
 //   536     8 hole_begin       tid    dssmd       see "Hole"; above 0 only in mirrors

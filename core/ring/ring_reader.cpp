@@ -56,7 +56,7 @@ ReadStatus RingReader::locate(Tid tid, Place& place, SampleInfo& info) const noe
   if (tid > top) return ReadStatus::not_yet;
   if (tid < 0 || tid < slots_.oldest_for(top)) return ReadStatus::too_old;
   SlotHeader& slot = slots_.slot(tid);
-  // Pairs with the release store of the even sequence in SlotWriter::publish(): what was stored
+  // Pairs with the release store of the even sequence in SlotWriter::finish(): what was stored
   // before it is visible after this.
   if (slot.sequence.load(std::memory_order_acquire) != published_sequence(tid)) {
     return status_of_absent(tid);

@@ -126,7 +126,8 @@ LockResult take_word(std::atomic<std::uint32_t>& word, std::uint32_t id, Duratio
 
 // state: 0, or FUTEX_OWNER_DIED
 void give_back(std::atomic<std::uint32_t>& word, std::uint32_t state) noexcept {
-  if (word.exchange(state, std::memory_order_release) & FUTEX_WAITERS) {
+  // Not only release: SlotWriter::publish_before_unlock() needs it as a barrier.
+  if (word.exchange(state, std::memory_order_seq_cst) & FUTEX_WAITERS) {
     ::syscall(SYS_futex, &word, FUTEX_WAKE, 1, nullptr, nullptr, 0);
   }
 }

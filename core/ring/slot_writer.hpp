@@ -41,9 +41,10 @@ class SlotWriter {
     header_->top.store(info.tid, std::memory_order_seq_cst);
   }
 
-  // The same for the holder of the lock, who unlocks before those loads. That is an atomic
-  // exchange: on x86-64 a full barrier, so one of the store's own, which takes another 5 ns, is not
-  // needed. On AArch64 it is none, but there this store is not slower than a release store.
+  // The same for the holder of the lock, who unlocks before those loads (RobustLock::unlock()).
+  // That is an atomic exchange: on x86-64 a full barrier, so one of the store's own, which takes
+  // another 5 ns, is not needed. On AArch64 it is not a full barrier, but a sequentially consistent
+  // store takes no longer than a release store there.
   void publish_before_unlock(const SampleInfo& info) const noexcept {
 #ifdef __x86_64__
     constexpr auto kOrder = std::memory_order_release;

@@ -7,7 +7,8 @@
 // The doorbells are armed only while an observer waits for a sample: a writer that is faster than
 // the network, or whose stream has no observer, writes without a system call. The ring is checked
 // again after arming, so that no sample is missed: either the writer sees the doorbell armed, or
-// the feed sees its sample (both sides store, then load, sequentially consistent).
+// the feed sees its sample (both sides store, then load, and no load passes the store:
+// SlotWriter::publish_before_unlock()).
 #pragma once
 
 #include <dssm/result.hpp>

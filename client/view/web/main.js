@@ -19,6 +19,8 @@ const kUrlMs = 300;
 const kTypeRetryMs = 2000;
 const kStepMs = 100; // where no stream is shown
 const kMaxMarginNs = 1000000000n; // from the oldest sample of a ring that is being written
+// What is said of a stream that has a sample at an instant, or may have.
+const kMayHaveOne = ["ok", "opening", "arriving", "lapped", "restarted"];
 const kMaxSteps = 12; // requests for one step
 
 const find = (id) => document.getElementById(id);
@@ -148,6 +150,14 @@ function beginning() {
   return first ?? range.oldest;
 }
 
+// Nothing that is shown has a sample at the instant that is played: the rings begin later, or lose
+// their samples as fast as they are played here, or faster. Goes on where they have some.
+function playOn() {
+  if (time.recorded || !time.range) return;
+  const first = beginning();
+  time.playFrom(first > time.t ? first : time.t + marginOf(time.range.newest - time.t));
+}
+
 // "host pc2 is down"; empty for a host that answers.
 function outageOf(stream) {
   const name = stream.slice(stream.lastIndexOf("@") + 1);
@@ -263,6 +273,7 @@ const atPump = new Pump(connection, kAtMs, async () => {
   const wanted = shown?.chosenStreams() ?? [];
   if (wanted.length === 0) return null;
   const t = time.instant();
+  const plays = time.mode === "play" && time.hover === null;
   let answer;
   try {
     answer = await connection.request("at", {
@@ -282,10 +293,8 @@ const atPump = new Pump(connection, kAtMs, async () => {
     if (at !== null) time.setShown(at);
   }
   const has = (status) => answer.head.samples.some((one) => one.status === status);
-  if (time.mode === "play" && !time.recorded && has("too_old") && !has("ok")) {
-    // The rings lose their samples as fast as they are played here, or faster.
-    time.skip(marginOf(time.range.newest - time.t));
-  }
+  const stillPlays = plays && time.mode === "play" && shown === page();
+  if (stillPlays && has("too_old") && !kMayHaveOne.some(has)) playOn();
   if (has("opening") || has("restarted")) return kOpeningMs;
   if (time.mode !== "hold" && time.hover === null) return 0;
   return has("arriving") || has("not_yet") || has("lapped") ? kArrivingMs : null;

@@ -72,9 +72,9 @@ export class Time extends EventTarget {
     }, kPlayMs);
   }
 
-  // Goes on playing `ns` later.
-  skip(ns) {
-    this.set("play", this.t + ns);
+  // Continues there.
+  playFrom(t) {
+    this.set("play", t);
   }
 
   toggle() {
