@@ -240,10 +240,14 @@ Duration behind_owner(const StreamInfo& stream) {
   return behind > 2 * between + kOnItsWay ? behind : Duration();
 }
 
+bool gets_samples(const MirrorInfo& mirror) {
+  return mirror.state == MirrorState::live || mirror.state == MirrorState::filling;
+}
+
 std::string carried_text(const StreamInfo& stream) {
   if (!stream.mirror || stream.mirror->recent_lost_samples == 0) return {};
   // What was counted before the owner was down says nothing of the network now.
-  if (stream.mirror->state != MirrorState::live || stream.rate_hz <= 0) return {};
+  if (!gets_samples(*stream.mirror) || stream.rate_hz <= 0) return {};
   const double share = 1 - static_cast<double>(stream.mirror->recent_lost_samples) /
                                static_cast<double>(stream.mirror->recent_samples);
   const double carried_hz = share * stream.rate_hz;

@@ -59,6 +59,8 @@ void add_details(Json& json, const StreamInfo& stream);
 
 // How much older the newest sample in its mirror is than its owner's; 0: the mirror is fresh.
 Duration behind_owner(const StreamInfo& stream);
+// Whether its owner sends it samples now. Its history may still be on its way.
+bool gets_samples(const MirrorInfo& mirror);
 // "carries 11 of 30 samples a second", of the network to the mirror; empty: it carries all.
 std::string carried_text(const StreamInfo& stream);
 

@@ -89,7 +89,7 @@ Finding check_mirrors(const Facts& facts) {
   std::string example;
   for (const StreamInfo& stream : facts.streams) {
     if (!stream.mirror) continue;
-    mirrors += stream.mirror->state == MirrorState::live && stream.mirror->max_rate_hz == 0 ? 1 : 0;
+    mirrors += gets_samples(*stream.mirror) && stream.mirror->max_rate_hz == 0 ? 1 : 0;
     std::string what = carried_text(stream);
     if (!what.empty()) {
       what = fmt::format("the network {}", what);

@@ -230,7 +230,7 @@ void FleetService::open_reader(const StreamId& id, bool history, const std::stri
             if (!ring) return then(std::move(ring).error());
             then(std::move(ring->stream));
           },
-          account);
+          account, history);
       return want();  // of a new mirror, which is not connected yet
     }
     if (Mirror* mirror = mirror_without_owner(id)) {

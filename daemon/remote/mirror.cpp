@@ -44,7 +44,7 @@ Result<void> Mirror::on_opened(StreamInfo theirs, bool) {
     stop(followed.error(), false);
     return {};
   }
-  is_removed_ = is_subscribed_ = false;
+  is_removed_ = is_subscribed_ = is_fresh_ = false;
   connection_.frames()->take_samples(theirs.type.payload_bytes, *this);
   ++subscriptions_;
   subscribe();
@@ -209,6 +209,7 @@ void Mirror::assess_clock() {
 
 [[gnu::hot]] Result<void> Mirror::on_sample_end(const wire::IncomingSample& sample, bool torn) {
   ring_->end(sample, torn);
+  is_fresh_ = true;
   log_new_gap();
   return {};
 }
@@ -308,8 +309,10 @@ void Mirror::notify_replaced() {
 
 // --- programs
 
-bool Mirror::can_open_now() const noexcept {
-  return ring_ && !is_removed_ && !is_ending_ && !is_filling();
+bool Mirror::can_open_now(bool waits_for_history) const noexcept {
+  const bool has_newest = newest_first_ && is_fresh_;
+  return ring_ && !is_removed_ && !is_ending_ &&
+         (!is_filling() || (has_newest && !waits_for_history));
 }
 
 Duration Mirror::open_timeout() const noexcept {

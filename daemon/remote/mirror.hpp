@@ -18,7 +18,8 @@
 // The states are drawn in remote_stream.hpp; `live` when what is fetched is here. If there is a
 // ring, a program gets it at once while the channel is closed, opening or live. While it is
 // subscribing and filling, and after the catalog or the owner said that the stream was removed, its
-// open() waits.
+// open() waits; while it is filling, not if the newest sample is here and the program has not asked
+// for history.
 #pragma once
 
 #include <cstdint>
@@ -77,7 +78,7 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
   void on_batch_end() override;
   // RemoteStream
   std::shared_ptr<Stream> stream() const noexcept override;
-  bool can_open_now() const noexcept override;
+  bool can_open_now(bool waits_for_history) const noexcept override;
   Duration open_timeout() const noexcept override;
   Result<void> check_open(const CreatePlan*) override { return clock_.check_opening(); }
   Result<void> use_offered(std::shared_ptr<Stream> stream) override;
@@ -107,6 +108,7 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
   proto::Mirror::State shown_state() const noexcept;
 
   bool newest_first_ = false;  // the owner has that feature
+  bool is_fresh_ = false;      // a sample has come on this connection
   bool history_wanted_ = false, history_always_ = false;
   bool with_history_ = false;   // the present subscription, and
   double max_rate_hz_ = 0;      // its rate; 0: all samples

@@ -157,9 +157,9 @@ Result<OpenedRing> RemoteStream::opened(const CreatePlan* plan) {
   return OpenedRing{acquire(), false};
 }
 
-void RemoteStream::open(const CreatePlan* plan, Then then) {
+void RemoteStream::open(const CreatePlan* plan, Then then, bool waits_for_history) {
   done_ = false;
-  if (can_open_now()) {
+  if (can_open_now(waits_for_history)) {
     then(opened(plan));
     return after_pending();
   }

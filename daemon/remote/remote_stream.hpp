@@ -180,7 +180,7 @@ class RemoteStream : private Dialer::Observer, protected channel::ChannelClient:
   bool done() const noexcept { return done_; }
 
   // Acquires the ring for a program, as RemoteStreams::open(). After connection().connect().
-  void open(const CreatePlan* plan, Then then);
+  void open(const CreatePlan* plan, Then then, bool waits_for_history = true);
   // Takes a ring that a program held while dssmd was not running. Another offer of the same ring
   // gives the same stream; with another ring it fails with conflict, and `files` stay as they are.
   Result<std::shared_ptr<Stream>> adopt_untrusted(OfferedFiles&& files);
@@ -216,7 +216,9 @@ class RemoteStream : private Dialer::Observer, protected channel::ChannelClient:
 
   virtual std::shared_ptr<Stream> stream() const noexcept = 0;  // of the ring; nullptr: none
   // Whether open() may be answered at once.
-  virtual bool can_open_now() const noexcept { return stream() && !is_removed_; }
+  virtual bool can_open_now(bool /*waits_for_history*/) const noexcept {
+    return stream() && !is_removed_;
+  }
   virtual Duration open_timeout() const noexcept { return kOwnerTimeout; }
   // Whether a program that asks for this may have the ring.
   virtual Result<void> check_open(const CreatePlan* plan) = 0;

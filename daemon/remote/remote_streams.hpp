@@ -41,13 +41,15 @@ class RemoteStreams final : private CatalogObserver {
   //   then   called once, from the loop or at once; not after this is destroyed
   //   account  who is charged for a new ring, also when others use it later, as
   //            Identity::account()
+  //   waits_for_history  of a mirror: also for what others have asked for and is on its way
   //   fails  not_found, type_mismatch, unavailable (the owner does not answer), limit_exceeded,
   //          conflict (two hosts of that name), clock_out_of_bounds
   void open(const KnownHost& host, const StreamId& id, const CreatePlan* plan,
-            RemoteStream::Then then, const std::string& account = {}) {
+            RemoteStream::Then then, const std::string& account = {},
+            bool waits_for_history = true) {
     const Result<Kind*> found = find_or_connect(host, id, account);
     if (!found) return then(found.error());
-    (*found)->open(plan, std::move(then));
+    (*found)->open(plan, std::move(then), waits_for_history);
   }
 
   // Takes a ring that a program held while dssmd was not running. `id` names the owner's host,

@@ -79,6 +79,8 @@ TEST(CarriedText, SaysNothingWhileTheOwnerIsDown) {
   mirror.recent_samples = 90;
   mirror.recent_lost_samples = 57;
   EXPECT_EQ(carried_text(stream), "carries 11 of 30 samples a second");
+  mirror.state = MirrorState::filling;
+  EXPECT_EQ(carried_text(stream), "carries 11 of 30 samples a second");
   mirror.state = MirrorState::owner_unavailable;
   EXPECT_EQ(carried_text(stream), "");
 }

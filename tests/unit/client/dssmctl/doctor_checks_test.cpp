@@ -556,6 +556,9 @@ TEST(Doctor, WarnsOfMirrorsThatTheNetworkCannotFill) {
   stream.mirror->newest = 999;
   stream.mirror->newest_time = time_from_ns(9'900'000'000);
   EXPECT_FINDING(facts, "mirrors", Status::ok, "");
+  stream.mirror->state = MirrorState::filling;
+  EXPECT_TRUE(finding_of(facts, "mirrors").text.ends_with("read of a stream of another host"));
+  stream.mirror->state = MirrorState::live;
   stream.mirror->newest_time = time_from_ns(8'000'000'000);
   EXPECT_FINDING(facts, "mirrors", Status::warn, "dssmctl info 'odom:0@pc2'");
   EXPECT_EQ(finding_of(facts, "mirrors").text, "'odom:0@pc2': 2.00 s behind its owner");

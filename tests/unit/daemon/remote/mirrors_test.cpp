@@ -206,6 +206,33 @@ TEST_F(MirrorsTest, AnswersWithWhatCameWhenTheHistoryTakesLong) {
   EXPECT_EQ(state().state(), proto::Mirror::FILLING);
 }
 
+// Others may want it.
+TEST_F(MirrorsTest, DoesNotLetThoseWaitForHistoryWhoDidNotAskForIt) {
+  wire::Greeting greeting = greeting_of("pc2");
+  greeting.features.emplace_back(wire::kFeatureNewestFirst);
+  owner->greet_as(greeting);
+  const auto open_without = [&] {
+    auto answer = std::make_shared<Answer>();
+    streams->open(
+        owner->host(), kOdometry, nullptr,
+        [answer](Result<OpenedRing> result) { answer->emplace(std::move(result)); }, {}, false);
+    return answer;
+  };
+  const auto recorder = open();
+  streams->find(kOdometry)->want_history(true);
+  serve(10);
+  EXPECT_FALSE(open_without()->has_value()) << "there is no sample yet";
+  samples(10, 10);
+  run_until(loop, [&] { return find() && newest(*find()) == 10; });
+  EXPECT_EQ(state().state(), proto::Mirror::FILLING);
+  const auto at_once = open_without();
+  ASSERT_TRUE(at_once->has_value());
+  EXPECT_EQ(newest(*at_once->value().value().stream), 10);
+  EXPECT_FALSE(recorder->has_value()) << "the history is still on its way";
+  owner->send_caught_up();
+  wait(recorder);
+}
+
 TEST_F(MirrorsTest, FailsWithAReasonWhenTheOwnerDoesNotAnswer) {
   const wire::Address address = owner->address();
   const KnownHost host = owner->host();
