@@ -417,6 +417,8 @@ TEST_F(BlackBox, ClosesStreamsThatAreRemovedButNotTheOneOfRequests) {
   auto power = std::optional(session_.create<Power>("power", depth_of(64)).value());
   Running running(recorder({"--before", "0", "--after", "1ms"}), environment());
   await_armed(power->id());
+  // Two: it also records them. It would say so if they were removed before it had them open.
+  await([&] { return session_.stream_info({"dssm_trigger", 0, ""}).value().readers == 2; });
   const StreamId id = power->id();
   power.reset();
   ASSERT_TRUE(session_.remove(id));
@@ -428,7 +430,8 @@ TEST_F(BlackBox, ClosesStreamsThatAreRemovedButNotTheOneOfRequests) {
   ASSERT_TRUE(session_.remove({"dssm_trigger", 0, ""}));
   await_armed(id);
   output({"trigger", "a"});
-  EXPECT_TRUE(running.line().ends_with("_a.mcap'"));
+  const std::string begun = running.line();
+  EXPECT_TRUE(begun.ends_with("_a.mcap'")) << begun;
 }
 
 TEST_F(BlackBox, KeepsTheQuotaOverRestartsAndLeavesOtherFilesAlone) {
