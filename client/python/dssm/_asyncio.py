@@ -6,7 +6,7 @@ socket. One task at a time may wait for a reader.
 """
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from types import TracebackType
 
 from dssm._dssm import Reader, Sample
@@ -45,14 +45,19 @@ class _Ready:
         if not self._loop.is_closed():
             self._loop.remove_reader(self._fd)
 
-    def end(self) -> None:
+    def on_closing(self) -> None:
         """Before the reader is closed, by this loop's thread or by another one."""
+        self._call(self._stop_waiting)
+
+    def on_closed(self) -> None:
+        """After that: a task that were woken before would find it open, and wait again."""
+        self._call(self.event.set)
+
+    def _call(self, function: Callable[[], None]) -> None:
         if asyncio._get_running_loop() is self._loop:
-            self._stop_waiting()
-            self.event.set()
+            function()
         elif not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._stop_waiting)
-            self._loop.call_soon_threadsafe(self.event.set)
+            self._loop.call_soon_threadsafe(function)
 
     def _on_readable(self) -> None:
         if not self.reader.closed:
@@ -62,10 +67,12 @@ class _Ready:
 
 def close(reader: Reader) -> None:
     """Closes it; a task that waits for it gets the error of a closed reader."""
-    for ready in list(_awaited.values()):
-        if ready.reader is reader:
-            ready.end()
+    waiting = [ready for ready in list(_awaited.values()) if ready.reader is reader]
+    for ready in waiting:
+        ready.on_closing()
     _close(reader)
+    for ready in waiting:
+        ready.on_closed()
 
 
 def leave(reader: Reader, *_: object) -> None:

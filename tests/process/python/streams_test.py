@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+import unittest.mock
 from decimal import Decimal
 from typing import Annotated
 
@@ -934,6 +935,23 @@ class Asyncio(Case):
                 self.reader = self.session.reader("async")
                 self.reader.seek(self.reader.newest_tid)
                 asyncio.run(asyncio.wait_for(run(wait, end), PATIENT_S))
+
+    def test_closing_by_a_thread_that_is_slow_ends_waiting(self):
+        closes = dssm._asyncio._close
+
+        def slow_close(reader):
+            time.sleep(0.2)  # the loop does what the thread has left it before
+            closes(reader)
+
+        async def run():
+            waiting = asyncio.create_task(self.reader.wait_async())
+            await asyncio.sleep(0)
+            await asyncio.to_thread(self.reader.close)
+            with self.assertRaises(dssm.Closed):
+                await waiting
+
+        with unittest.mock.patch.object(dssm._asyncio, "_close", slow_close):
+            asyncio.run(asyncio.wait_for(run(), PATIENT_S))
 
     def test_several_readers_in_one_loop(self):
         async def first(reader):
