@@ -242,9 +242,9 @@ void ChannelServer::on_stream_removed(const Stream& stream) {
   for (const auto& [key, communicator] : communicators_) communicator->on_stream_removed(stream);
 }
 
-void ChannelServer::on_heartbeat(const wire::Greeting& them,
+void ChannelServer::on_heartbeat(const wire::Greeting* host,
                                  const std::optional<clock::HeartbeatTimes>& returned) {
-  if (parts_.on_heartbeat) parts_.on_heartbeat(them, returned);
+  if (host && parts_.on_heartbeat) parts_.on_heartbeat(*host, returned);
   const MonoTime now = parts_.loop.now();
   if (now - checked_ < kCheckPeriod) return;
   checked_ = now;

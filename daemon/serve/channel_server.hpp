@@ -38,7 +38,8 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
     const Rights& rights;
     Logger& logger;
     ClockAssessor* clock = nullptr;  // nullptr: the clock is not watched
-    // As in DataCommunicator::Observer, about once a second from each host; may be empty.
+    // As in DataCommunicator::Observer, about once a second from each host that proves which one
+    // it is; may be empty.
     std::function<void(const wire::Greeting&, const std::optional<clock::HeartbeatTimes>&)>
         on_heartbeat = {};
     bool takes_plain = false;  // with credentials: from other PCs, too
@@ -113,7 +114,7 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
   void on_recovered() override;
   void on_ended(DataCommunicator& communicator) override;
   void on_greeted(DataCommunicator& communicator) override { forget_arrival(communicator); }
-  void on_heartbeat(const wire::Greeting& them,
+  void on_heartbeat(const wire::Greeting* host,
                     const std::optional<clock::HeartbeatTimes>& returned) override;
 
   Parts parts_;

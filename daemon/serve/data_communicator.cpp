@@ -179,6 +179,13 @@ bool DataCommunicator::can_serve(const net::Frame& request) const {
   return channel_ ? !channel_->busy() : !must_wait_for_recovery(request, parts_.registry);
 }
 
+// Whether it is the dssmd that it says it is. A host without credentials has to believe that.
+bool DataCommunicator::proves_host() const {
+  if (!them_->is_dssmd()) return false;
+  if (!wire::credentials_of(parts_.self)) return true;
+  return identity_.certified && identity_.certified->kind == wire::CertifiedPeer::Kind::host;
+}
+
 void DataCommunicator::become_control() {
   if (!std::exchange(is_control_, true)) link_.stamp_arrivals();  // of heartbeats
 }
@@ -239,7 +246,7 @@ Result<void> DataCommunicator::dispatch(const net::Frame& request) {
     }
     // All other work first: a PC that has answered is done, which matters where several virtual
     // machines share a processor. The time that it takes is known there.
-    parts_.observer.on_heartbeat(*them_, returned);
+    parts_.observer.on_heartbeat(proves_host() ? &*them_ : nullptr, returned);
     const RawTime now = RawClock::now();
     if (request.ping().raw_ns()) pong_sent_ = now;
     pong.mutable_pong()->set_raw_ns(to_ns(now));

@@ -102,9 +102,10 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
     // The peer has sent its Hello.
     virtual void on_greeted(DataCommunicator& /*communicator*/) {}
     // A heartbeat arrived; it is answered afterwards.
+    //   host      whose it is; nullptr: a program's, or of one that does not prove which host it is
     //   returned  when this host's answer to the heartbeat before left and came there, and when
     //             this heartbeat left there and came; nullopt: not known. Untrusted
-    virtual void on_heartbeat(const wire::Greeting& /*them*/,
+    virtual void on_heartbeat(const wire::Greeting* /*host*/,
                               const std::optional<clock::HeartbeatTimes>& /*returned*/) {}
 
    protected:
@@ -169,6 +170,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   void work_guarded();
 
   Result<void> greet(const net::Frame& frame);
+  bool proves_host() const;
   void become_control();
   bool can_serve(const net::Frame& request) const;
   void serve(const net::Frame& request);

@@ -454,7 +454,7 @@ TEST(DataCommunicator, ReportsWhatTheHeartbeatsOfAPeerSayOfTheClocks) {
     reported.push_back(returned);
   };
   MemoryPeer peer;
-  rig.connect(peer);
+  rig.connect(peer, true, true, 2, "dssmd");
   const auto ping = [&](std::uint64_t serial, std::int64_t raw_ns, std::int64_t answered_ns) {
     net::Frame frame = with_serial(serial, ping_frame());
     frame.mutable_ping()->set_raw_ns(raw_ns);
@@ -477,6 +477,17 @@ TEST(DataCommunicator, ReportsWhatTheHeartbeatsOfAPeerSayOfTheClocks) {
   EXPECT_FALSE(reported[3]);
   const net::Pong answer = ping(7, 5000, 0);
   EXPECT_GE(answer.raw_ns(), to_ns(reported_at)) << "answering is the last thing to do";
+}
+
+// It may greet with the id of any host.
+TEST(DataCommunicator, ReportsNoHeartbeatsOfPrograms) {
+  int reported = 0;
+  ServerRig rig;
+  rig.on_heartbeat = [&](const auto&, const auto&) { ++reported; };
+  MemoryPeer program;
+  rig.connect(program);
+  EXPECT_TRUE(rig.ask(program, with_serial(3, ping_frame())).has_pong());
+  EXPECT_EQ(reported, 0);
 }
 
 // One with a channel, or with heartbeats, stays.

@@ -87,8 +87,12 @@ class SecureServer : public testing::Test {
   const Rights rights{};
   LogRecorder logger;
   std::shared_ptr<wire::OwnCredentials> own = issue(Authority::host("pc1"));
+  std::vector<std::string> heartbeats;  // of which hosts
   ChannelServer server{
-      {loop, registry, opens, rights, logger}, with(own, "pc1"), {8, 4, 32U << 20}};
+      {loop, registry, opens, rights, logger, nullptr,
+       [this](const wire::Greeting& host, const auto&) { heartbeats.push_back(host.host); }},
+      with(own, "pc1"),
+      {8, 4, 32U << 20}};
   NetworkListener::Inherited none;
   NetworkListener network =
       NetworkListener::open(
@@ -152,6 +156,19 @@ TEST_F(SecureServer, SaysWhyACertificateIsNotAccepted) {
 // A program of this PC that has no credentials.
 TEST_F(SecureServer, TakesPlainConnectionsFromItsOwnPc) {
   wait_until_up(dial(greeting_of("pc1", "viewer")));
+}
+
+TEST_F(SecureServer, BelievesHeartbeatsOfHostsWithACertificateOnly) {
+  dial(greeting_of("pc3"));  // from its own PC, where a program may say that it is any host
+  dial(with(issue(Authority::program("viewer")), "pc4", "viewer"));
+  dial(with(issue(Authority::host("pc2")), "pc2"));
+  for (Guest& guest : guests) {
+    wait_until_up(guest);
+    guest.dialer.connection()->send(with_serial(1, ping_frame()));
+    run_until(loop, [&] { return !guest.frames.empty(); });
+    EXPECT_TRUE(guest.frames[0].has_pong());
+  }
+  EXPECT_EQ(heartbeats, std::vector<std::string>{"pc2"});
 }
 
 TEST_F(SecureServer, EndsConnectionsOfARevokedHostAtAReload) {

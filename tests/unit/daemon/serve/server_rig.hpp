@@ -46,12 +46,13 @@ class ServerRig {
                greeting_with(own_clock), limits) {}
 
   // Connects; without `greet` it says nothing. The peer outlives the rig's use of it.
-  void connect(MemoryPeer& peer, bool greet = true, bool torn = true, std::uint32_t host = 2) {
+  void connect(MemoryPeer& peer, bool greet = true, bool torn = true, std::uint32_t host = 2,
+               const std::string& program = "test") {
     const Result<void> adopted =
         server.adopt(std::make_unique<MemoryTransport>(peer), address_of(host));
     ASSERT_TRUE(adopted) << adopted.error().message;
     if (!greet) return;
-    const wire::Greeting greeting = greeting_of("pc" + std::to_string(host), "test");
+    const wire::Greeting greeting = greeting_of("pc" + std::to_string(host), program);
     peer.put(hello_frame(torn ? greeting : without_features(greeting)));
     turns();
     const std::vector<net::Frame> frames = peer.take();
