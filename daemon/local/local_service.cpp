@@ -636,8 +636,13 @@ bool LocalService::serve_deferred(ClientNumber number) {
   const Deferred next = std::move(*ready);
   client.deferred.erase(ready);
   client.deferred_bytes -= next.bytes;
-  DescriptorQueue none;
-  serve(number, next.request, none);
+  // The rights may have changed meanwhile.
+  if (Result<void> allowed = check_access(client, next.request); !allowed) {
+    send_failure(client, next.request.serial(), allowed.error());
+  } else {
+    DescriptorQueue none;
+    serve(number, next.request, none);
+  }
   return clients_.contains(number);
 }
 

@@ -187,6 +187,20 @@ class LocalRightsTest : public testing::Test {
   }
 };
 
+TEST_F(LocalRightsTest, CountWhenARequestThatHasWaitedIsServed) {
+  registry.begin_recovery(Registry::Recovery::streams);
+  local::Request remove;
+  remove.set_serial(50);
+  remove.mutable_remove()->mutable_id()->set_name("lidar");
+  ASSERT_TRUE(client.put(remove));
+  set({"user:1000 read *"});
+  EXPECT_TRUE(client.received.empty()) << "the stream may still be offered";
+  registry.end_recovery();
+  const local::Response refused = client.next();
+  EXPECT_EQ(refused.serial(), 50U);
+  EXPECT_EQ(refused.failure().code(), "no_permission") << refused.failure().message();
+}
+
 TEST_F(LocalRightsTest, ListsAndEventsShowWhatTheAskerMaySee) {
   ASSERT_TRUE(client.ask(daemon::create_request("lidar")).has_opened());
   ASSERT_TRUE(client.ask(daemon::create_request("secret")).has_opened());
