@@ -34,7 +34,8 @@ Result<IoResult> send_some(int socket, std::span<const std::byte> bytes, std::sp
   }
 }
 
-Result<IoResult> recv_some(int socket, std::span<std::byte> space, std::vector<UniqueFd>& fds) {
+Result<IoResult> recv_some(int socket, std::span<std::byte> space, std::vector<UniqueFd>& fds,
+                           int flags) {
   alignas(cmsghdr) std::byte control[CMSG_SPACE(sizeof(int) * kMaxFdsPerMessage)];
   iovec part{space.data(), space.size()};
   msghdr message{};
@@ -44,7 +45,7 @@ Result<IoResult> recv_some(int socket, std::span<std::byte> space, std::vector<U
   message.msg_controllen = sizeof control;
   ssize_t received = 0;
   do {
-    received = ::recvmsg(socket, &message, MSG_CMSG_CLOEXEC);
+    received = ::recvmsg(socket, &message, flags | MSG_CMSG_CLOEXEC);
   } while (received < 0 && errno == EINTR);
   if (received < 0) {
     if (errno == EAGAIN) return IoResult{IoStatus::would_block, 0};

@@ -32,7 +32,9 @@ Result<IoResult> send_some(int socket, std::span<const std::byte> bytes, std::sp
 
 // Receives up to space.size() bytes; descriptors that came along are appended to `fds`,
 // close-on-exec. Fails with `protocol` when the kernel dropped some of them.
-Result<IoResult> recv_some(int socket, std::span<std::byte> space, std::vector<UniqueFd>& fds);
+//   flags  MSG_PEEK: bytes and descriptors stay in the socket as well
+Result<IoResult> recv_some(int socket, std::span<std::byte> space, std::vector<UniqueFd>& fds,
+                           int flags = 0);
 
 // Creates a Unix stream socket connected to `path`, close-on-exec and blocking.
 //   fails  no_daemon (no such socket, or no process listens), no_permission, invalid_argument (path

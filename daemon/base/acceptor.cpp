@@ -29,7 +29,11 @@ Acceptor::Acceptor(const EventLoop& loop, Logger& logger, std::string peer, std:
       host_(std::move(host)),
       message_id_(message_id),
       accept_(std::move(accept)),
-      spare_(make_spare()) {}
+      spare_(make_spare()),
+      pause_(EventSource::timer(loop, [this] {
+        if (!spare_) spare_ = make_spare();
+        for (EventSource& listener : listeners_) listener.enable();
+      })) {}
 
 void Acceptor::listen(int listener) {
   listeners_.push_back(
@@ -39,9 +43,12 @@ void Acceptor::listen(int listener) {
 
 void Acceptor::on_connection(int listener) {
   for (int i = 0; i < kConnectionsPerTurn; ++i) {
+    if (closer_.is_full && closer_.is_full()) return pause();
     UniqueFd socket = accept_at(listener);
     if (socket) {
-      if (Result<void> accepted = accept_(socket); !accepted) refuse(socket, accepted.error());
+      if (Result<void> accepted = accept_(socket); !accepted) {
+        refuse(std::move(socket), accepted.error());
+      }
     } else if (errno == EMFILE || errno == ENFILE) {
       return accept_to_refuse(listener);
     } else if (errno == EINTR || errno == ECONNABORTED) {
@@ -57,21 +64,28 @@ void Acceptor::on_connection(int listener) {
 
 void Acceptor::accept_to_refuse(int listener) {
   spare_.reset();
-  if (const UniqueFd socket = accept_at(listener); socket) {
-    refuse(socket,
+  if (UniqueFd socket = accept_at(listener); socket) {
+    refuse(std::move(socket),
            {Errc::limit_exceeded,
             fmt::format("dssmd of host '{}' has no descriptors left (ulimit -n, LimitNOFILE=); "
                         "raise that limit, or lower max_clients, max_streams and max_connections",
                         host_)});
   }
   spare_ = make_spare();
+  if (!spare_) pause();  // the closer has that socket still
 }
 
-void Acceptor::refuse(const UniqueFd& socket, const Error& error) {
+void Acceptor::pause() {
+  for (EventSource& listener : listeners_) listener.disable();
+  pause_.enable_in(kPause);
+}
+
+void Acceptor::refuse(UniqueFd socket, const Error& error) {
   logger_.warning(fmt::format("refuse {}: {}", peer_, error.message), {.message_id = message_id_});
   const std::string frame = wire::final_failure(error);
   // As much as the socket takes at once.
   static_cast<void>(::send(socket.get(), frame.data(), frame.size(), MSG_NOSIGNAL | MSG_DONTWAIT));
+  if (closer_.close) closer_.close(std::move(socket));
 }
 
 }  // namespace dssm::daemon

@@ -6,7 +6,9 @@
 // refused, and the loop would spin.
 #pragma once
 
+#include <chrono>
 #include <dssm/result.hpp>
+#include <dssm/time.hpp>
 #include <functional>
 #include <string>
 #include <vector>
@@ -21,6 +23,8 @@ class Acceptor {
  public:
   // Accepted in a row before existing connections get their turn.
   static constexpr int kConnectionsPerTurn = 16;
+  // Until it is tried again whether one can be accepted.
+  static constexpr Duration kPause = std::chrono::milliseconds(100);
 
   // Serves an accepted socket, which is non-blocking; moves from `socket` only if it succeeds. An
   // error refuses the connection.
@@ -33,21 +37,31 @@ class Acceptor {
   Acceptor(const Acceptor&) = delete;
   Acceptor& operator=(const Acceptor&) = delete;
 
+  // What closes a refused socket; without it, the loop does.
+  struct Closer {
+    std::function<void(UniqueFd socket)> close;
+    std::function<bool()> is_full;  // asked before each accept; while it is, nobody is accepted
+  };
+  void set_closer(Closer closer) { closer_ = std::move(closer); }
+
   // Accepts from now on at `listener`, which outlives this.
   void listen(int listener);
 
  private:
   void on_connection(int listener);
   void accept_to_refuse(int listener);
-  void refuse(const UniqueFd& socket, const Error& error);
+  void refuse(UniqueFd socket, const Error& error);
+  void pause();
 
   const EventLoop& loop_;
   Logger& logger_;
   const std::string peer_, host_;
   const std::string_view message_id_;
   const Accept accept_;
+  Closer closer_;
   UniqueFd spare_;
   std::vector<EventSource> listeners_;
+  EventSource pause_;
 };
 
 }  // namespace dssm::daemon

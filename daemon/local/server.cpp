@@ -13,11 +13,13 @@
 #include <cerrno>
 #include <cstring>
 #include <new>
+#include <span>
 #include <utility>
 
 #include "core/base/try.hpp"
 #include "core/wire/local_protocol.hpp"
 #include "daemon/base/message_ids.hpp"
+#include "daemon/streams/memory_files.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -35,6 +37,23 @@ Result<bool> remove_stale(const std::string& path) {
   }
   if (::unlink(path.c_str())) return os_error("remove the old socket '" + path + "'");
   return true;
+}
+
+// Ends the connection for the other side. Whether it has sent what was not received: descriptors,
+// perhaps, which close() of the socket would close as well.
+bool end_with_unread(int socket) {
+  ::shutdown(socket, SHUT_RDWR);  // from now on nothing comes
+  int unread = 0;
+  return ::ioctl(socket, SIOCINQ, &unread) || unread > 0;
+}
+
+Result<ucred> user_of(int socket) {
+  ucred peer{};
+  socklen_t length = sizeof peer;
+  if (::getsockopt(socket, SOL_SOCKET, SO_PEERCRED, &peer, &length)) {
+    return os_error("get the credentials of a program");
+  }
+  return peer;
 }
 
 // The groups of the program on the other side, besides that of SO_PEERCRED; when the kernel does
@@ -148,6 +167,10 @@ Connection::Connection(const EventLoop& loop, UniqueFd socket, const Identity& i
 Connection::~Connection() {
   if (is_open()) leaves_ = service_.disconnect(number_);
   while (leaves_) leaves_ = service_.leave(number_, by_client_);
+  if (!is_open()) return;
+  readable_.disable();
+  writable_.disable();
+  close_socket();
 }
 
 // An exception that leaves a callback would end dssmd.
@@ -162,12 +185,25 @@ void Connection::guarded(Work work) {
 }
 
 void Connection::on_readable() {
-  std::vector<UniqueFd> descriptors;
-  const Result<wire::IoResult> got = wire::recv_some(socket_.get(), input_.space(), descriptors);
+  // Looks first: of what is received, the kernel closes here what this process cannot take.
+  const std::span<std::byte> space = input_.space();
+  const Result<wire::IoResult> got = wire::recv_some(socket_.get(), space, unchecked_, MSG_PEEK);
   if (!got) return end_with(got.error());
   if (got->status == wire::IoStatus::would_block) return;
   if (got->status == wire::IoStatus::end) return close(true);
-  input_.commit(got->bytes);
+  if (!std::all_of(unchecked_.begin(), unchecked_.end(),
+                   [](const UniqueFd& fd) { return closes_at_once(fd.get()); })) {
+    return end_with({Errc::protocol,
+                     "descriptors came that are neither memory files nor doorbells; no request "
+                     "takes others"});
+  }
+  std::vector<UniqueFd> descriptors = std::exchange(unchecked_, {});
+  ssize_t taken = 0;
+  do {
+    taken = ::recv(socket_.get(), space.data(), got->bytes, 0);
+  } while (taken < 0 && errno == EINTR);
+  if (taken < 0) return end_with(os_error("receive from the local socket"));
+  input_.commit(static_cast<std::size_t>(taken));
   if (charge_input() && take_descriptors(std::move(descriptors))) serve_frames();
 }
 
@@ -344,6 +380,13 @@ void Connection::end_with(const Error& error) {
   close();
 }
 
+void Connection::close_socket() {
+  std::vector<UniqueFd> group = std::exchange(unchecked_, {});
+  UniqueFd socket = std::move(socket_);
+  if (end_with_unread(socket.get())) group.push_back(std::move(socket));
+  if (!group.empty()) user_.closer.close(std::move(group));
+}
+
 void Connection::close(bool by_client) {
   if (!is_open()) return;
   readable_.disable();
@@ -352,7 +395,7 @@ void Connection::close(bool by_client) {
   greeting_timeout_.disable();
   request_timeout_.disable();
   output_timer_.disable();
-  socket_.reset();
+  close_socket();
   output_.clear();
   arrived_.clear();
   input_share_ = {};
@@ -383,6 +426,11 @@ Server::Server(const EventLoop& loop, const Listener& listener, const std::strin
       sweep_(EventSource::timer(loop, [this] { sweep(); })),
       acceptor_(loop, logger, "a program", host, message_id::kClientRefused,
                 [this](UniqueFd& socket) { return accept(socket); }) {
+  acceptor_.set_closer({[this](UniqueFd socket) { close_refused(std::move(socket)); },
+                        [this] {
+                          for (auto& [uid, user] : users_) user.closer.go_on();
+                          return unclosed() >= 2 * limits_.max_clients;
+                        }});
   acceptor_.listen(listener.fd());
 }
 
@@ -390,10 +438,10 @@ void Server::add_limits(LimitUses& out) const {
   std::uint64_t clients = 0, bytes = 0;
   for (const auto& [uid, user] : users_) {
     if (!user.is_limited) continue;
-    clients = std::max(clients, user.clients);
+    clients = std::max(clients, user.places());
     bytes = std::max(bytes, user.messages.used());
   }
-  const std::uint64_t connected = connections_.size() - ended_.size();
+  const std::uint64_t connected = connections_.size() - ended_.size() + unclosed();
   out.push_back({"max_clients", connected, limits_.max_clients, "programs"});
   out.push_back({"max_clients_per_user", clients, limits_.max_clients_per_user, "programs"});
   out.push_back({"long messages", messages_.used(), messages_.limit(), "bytes"});
@@ -401,24 +449,23 @@ void Server::add_limits(LimitUses& out) const {
 }
 
 Result<void> Server::accept(UniqueFd& socket) {
-  if (connections_.size() - ended_.size() >= limits_.max_clients) {
+  if (connections_.size() - ended_.size() + unclosed() >= limits_.max_clients) {
     return Error{Errc::limit_exceeded,
                  fmt::format("max_clients = {} programs are connected already; end some or raise "
                              "the key max_clients",
                              limits_.max_clients)};
   }
-  ucred peer{};
-  socklen_t length = sizeof peer;
-  if (::getsockopt(socket.get(), SOL_SOCKET, SO_PEERCRED, &peer, &length)) {
-    return os_error("get the credentials of a program");
-  }
+  const ucred peer = DSSM_TRY(user_of(socket.get()));
   UserAccount& user = users_.try_emplace(peer.uid, peer.uid).first->second;
-  if (user.is_limited && user.clients >= limits_.max_clients_per_user) {
+  if (user.is_limited && user.places() >= limits_.max_clients_per_user) {
     return Error{Errc::limit_exceeded,
                  fmt::format("max_clients_per_user = {} programs of user {} are connected already; "
                              "end some or raise the key max_clients_per_user",
                              limits_.max_clients_per_user, user.uid)};
   }
+  // Where the kernel drops what is out of band, it closes descriptors here.
+  const int is_inline = 1;
+  ::setsockopt(socket.get(), SOL_SOCKET, SO_OOBINLINE, &is_inline, sizeof is_inline);
   Identity identity;
   identity.pid = peer.pid;
   identity.uid = peer.uid;
@@ -426,6 +473,22 @@ Result<void> Server::accept(UniqueFd& socket) {
   identity.groups = groups_of(socket.get());
   keep(std::move(socket), identity, user);
   return {};
+}
+
+void Server::close_refused(UniqueFd socket) {
+  if (!end_with_unread(socket.get())) return;
+  const Result<ucred> peer = user_of(socket.get());
+  const uid_t uid = peer ? peer->uid : static_cast<uid_t>(-1);
+  std::vector<UniqueFd> group;
+  group.push_back(std::move(socket));
+  users_.try_emplace(uid, uid).first->second.closer.close(std::move(group));
+}
+
+// Sockets of programs that are gone, and that dssmd still has.
+std::uint64_t Server::unclosed() const {
+  std::uint64_t all = 0;
+  for (const auto& [uid, user] : users_) all += user.closer.unclosed();
+  return all;
 }
 
 void Server::keep(UniqueFd socket, const Identity& identity, UserAccount& user) {
@@ -443,7 +506,7 @@ void Server::keep(UniqueFd socket, const Identity& identity, UserAccount& user) 
 
 void Server::sweep() {
   for (const std::uint64_t number : std::exchange(ended_, {})) connections_.erase(number);
-  std::erase_if(users_, [](const auto& entry) { return entry.second.clients == 0; });
+  std::erase_if(users_, [](const auto& entry) { return entry.second.places() == 0; });
 }
 
 }  // namespace dssm::daemon

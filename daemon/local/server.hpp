@@ -25,6 +25,7 @@
 #include "core/base/unique_fd.hpp"
 #include "core/wire/frame.hpp"
 #include "daemon/base/acceptor.hpp"
+#include "daemon/base/descriptor_closer.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/limit_use.hpp"
 #include "daemon/base/log.hpp"
@@ -110,8 +111,12 @@ struct UserAccount {
         messages(is_limited ? kMaxMessageBytesPerUser : kMaxMessageBytes) {}
   const uid_t uid;
   const bool is_limited;
+  std::uint64_t places() const { return clients + closer.unclosed(); }
   std::uint64_t clients = 0;
   MemoryBudget messages;  // memory for long ones
+  // Of the sockets, and of what came by them. What it has not closed counts as clients, so that
+  // nobody can have it hold ever more.
+  DescriptorCloser closer;
 };
 
 // One client's socket: cuts its bytes into frames for LocalService and sends the responses. It
@@ -153,6 +158,7 @@ class Connection final : public ClientOutput {
   bool charge_output();
   Error no_memory_for(std::string_view what) const;
   bool take_descriptors(std::vector<UniqueFd> arrived);
+  void close_socket();
   bool send_some(Outgoing& outgoing);
   void stop_output();
   void watch_output();
@@ -174,6 +180,7 @@ class Connection final : public ClientOutput {
   MemoryBudget& messages_;
   UserAccount& user_;
   Share input_share_, output_share_;
+  std::vector<UniqueFd> unchecked_;  // descriptors whose close() may wait
   DescriptorQueue arrived_;
   std::deque<Outgoing> output_;
   std::size_t queued_bytes_ = 0, queued_descriptors_ = 0;
@@ -210,6 +217,8 @@ class Server {
 
  private:
   Result<void> accept(UniqueFd& socket);
+  void close_refused(UniqueFd socket);
+  std::uint64_t unclosed() const;
   void keep(UniqueFd socket, const Identity& identity, UserAccount& user);
   void sweep();
 

@@ -126,6 +126,12 @@ DescriptorKind kind_of_untrusted(int fd) {
   return DescriptorKind::other;
 }
 
+bool closes_at_once(int fd) {
+  // Where a file system of a program is mounted, that program chooses the names of files, too; only
+  // those in memory can have seals.
+  return ::fcntl(fd, F_GET_SEALS) >= 0 || kind_of_untrusted(fd) == DescriptorKind::doorbell;
+}
+
 bool same_file(int fd, int other_fd) noexcept {
   struct stat one {
   }, other{};

@@ -28,6 +28,10 @@ std::string memory_file_name(int fd);
 enum class DescriptorKind : unsigned char { other, ring, bell, meta, doorbell, playback_clock };
 DescriptorKind kind_of_untrusted(int fd);
 
+// Whether close() of it waits for nobody, whoever opened it: a memory file or an eventfd. Waits for
+// nobody itself.
+bool closes_at_once(int fd);
+
 // Whether both are the same file.
 bool same_file(int fd, int other_fd) noexcept;
 

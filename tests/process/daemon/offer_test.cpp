@@ -4,6 +4,7 @@
 // honest and the forged ones. The same with real programs is in tests/process/client.
 #include <fcntl.h>
 #include <gtest/gtest.h>
+#include <sys/eventfd.h>
 #include <sys/mman.h>
 #include <sys/stat.h>
 #include <unistd.h>
@@ -206,6 +207,14 @@ TEST_F(Offer, UnderAnotherNameIsRefused) {
 TEST_F(Offer, OfWhatAreNoMemoryFilesIsRefused) {
   std::vector<UniqueFd> held;
   for (int i = 0; i < 3; ++i) held.emplace_back(::open("/dev/zero", O_RDWR | O_CLOEXEC));
+  {
+    RawClient client(daemon_.socket_path());
+    client.send(offer_request("odometry", true), numbers(held));
+    EXPECT_EQ(client.receive().response.failure().code(), "protocol");
+    EXPECT_TRUE(client.receive().ended);
+  }
+  held.clear();
+  for (int i = 0; i < 3; ++i) held.emplace_back(::eventfd(0, EFD_CLOEXEC));
   EXPECT_EQ(refusal("odometry", held), "protocol");
   held.pop_back();
   EXPECT_EQ(refusal("odometry", held), "protocol") << "two descriptors are not three";

@@ -4,13 +4,17 @@
 #include "daemon/local/server.hpp"
 
 #include <gtest/gtest.h>
+#include <netinet/in.h>
+#include <sys/eventfd.h>
 #include <sys/socket.h>
 #include <sys/un.h>
 
+#include <cerrno>
 #include <cstring>
 #include <filesystem>
 
 #include "core/wire/frame.hpp"
+#include "core/wire/local_protocol.hpp"
 #include "tests/support/daemon_process.hpp"
 #include "tests/unit/daemon/local/fake_client.hpp"
 #include "tests/unit/daemon/run_loop.hpp"
@@ -53,7 +57,7 @@ class ServerTest : public testing::Test, protected LocalDaemon {
     ssize_t got = 0;
     while ((got = read(program, 1 << 16)) > 0) {
     }
-    return got == 0;
+    return got == 0 || errno == ECONNRESET;  // the latter where the server has not read all
   }
   void pass(Duration time) {
     bool is_over = false;
@@ -66,7 +70,8 @@ class ServerTest : public testing::Test, protected LocalDaemon {
   const std::string path = dir / "dssmd.sock";
   EventLoop loop = EventLoop::open(TimerQueue::Time::simulated).value();
   Listener listener = Listener::open(path, std::nullopt, 0600).value();
-  Server server{loop, listener, "pc1", {10, 10}, service, logger};
+  static constexpr std::uint64_t kMaxClients = 10;
+  Server server{loop, listener, "pc1", {kMaxClients, kMaxClients}, service, logger};
 };
 
 TEST_F(ServerTest, DisconnectsAProgramThatDoesNotRead) {
@@ -181,6 +186,143 @@ TEST_F(ServerTest, TellsManyStreamsAsFastAsAProgramReads) {
     run_turns(loop, 20);
   }
   EXPECT_EQ(events, kStreams);
+}
+
+// Programs that send descriptors whose close() waits.
+class ServerWithDescriptorsTest : public ServerTest {
+ protected:
+  static constexpr int kLingerSeconds = 30;
+
+  // A TCP socket that lingers, and has more to send than is read at its other end.
+  UniqueFd lingering_socket() {
+    const UniqueFd place(::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0));
+    sockaddr_in address{};
+    address.sin_family = AF_INET;
+    address.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+    socklen_t length = sizeof address;
+    auto* generic = reinterpret_cast<sockaddr*>(&address);
+    EXPECT_EQ(::bind(place.get(), generic, length), 0);
+    EXPECT_EQ(::getsockname(place.get(), generic, &length), 0);
+    EXPECT_EQ(::listen(place.get(), 1), 0);
+    UniqueFd socket(::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0));
+    EXPECT_EQ(::connect(socket.get(), generic, length), 0);
+    ends.emplace_back(::accept4(place.get(), nullptr, nullptr, SOCK_CLOEXEC));
+    const std::string much(1 << 20, 'x');
+    while (::send(socket.get(), much.data(), much.size(), MSG_DONTWAIT) > 0) {
+    }
+    const linger long_one{1, kLingerSeconds};
+    EXPECT_EQ(::setsockopt(socket.get(), SOL_SOCKET, SO_LINGER, &long_one, sizeof long_one), 0);
+    return socket;
+  }
+
+  static void send(const UniqueFd& program, std::string bytes, const std::vector<int>& descriptors,
+                   int flags = 0) {
+    const std::size_t length = descriptors.size() * sizeof(int);
+    std::vector<char> control(CMSG_SPACE(length));
+    iovec part{bytes.data(), bytes.size()};
+    msghdr message{};
+    message.msg_iov = &part;
+    message.msg_iovlen = 1;
+    message.msg_control = control.data();
+    message.msg_controllen = control.size();
+    cmsghdr* header = CMSG_FIRSTHDR(&message);
+    header->cmsg_level = SOL_SOCKET;
+    header->cmsg_type = SCM_RIGHTS;
+    header->cmsg_len = CMSG_LEN(length);
+    std::memcpy(CMSG_DATA(header), descriptors.data(), length);
+    EXPECT_EQ(::sendmsg(program.get(), &message, MSG_NOSIGNAL | flags), std::ssize(bytes));
+  }
+  // The same of one that only the server has afterwards.
+  void send_lingering(const UniqueFd& program, const std::string& bytes, int flags = 0) {
+    const UniqueFd socket = lingering_socket();
+    send(program, bytes, {socket.get()}, flags);
+  }
+
+  void serve_without_waiting() {
+    const MonoTime begin = MonoClock::now();
+    run_turns(loop, 20);
+    EXPECT_LT(MonoClock::now() - begin, std::chrono::seconds(kLingerSeconds / 2))
+        << "the loop has waited in close()";
+  }
+  std::uint64_t clients() const {
+    LimitUses uses;
+    server.add_limits(uses);
+    EXPECT_EQ(uses.front().name, "max_clients");
+    return uses.front().used;
+  }
+
+  std::vector<UniqueFd> ends;  // the other ones: when one is closed, close() waits no longer
+};
+
+TEST_F(ServerWithDescriptorsTest, DoesNotWaitToCloseThoseThatItReceives) {
+  UniqueFd program = connect(list_request());
+  send_lingering(program, "\1");
+  program.reset();
+  serve_without_waiting();
+  EXPECT_EQ(service.clients(), 0U);
+  EXPECT_TRUE(logger.contains("descriptors came that are neither memory files nor doorbells"));
+}
+
+TEST_F(ServerWithDescriptorsTest, DoesNotWaitToCloseThoseThatItDoesNotReceive) {
+  const UniqueFd program = connect(list_request()), event(::eventfd(0, EFD_CLOEXEC));
+  send(program, std::string(16, '\xff'), {event.get()});  // ends the connection
+  send_lingering(program, "\1");
+  serve_without_waiting();
+  EXPECT_EQ(service.clients(), 0U);
+  EXPECT_TRUE(is_closed(program));
+}
+
+TEST_F(ServerWithDescriptorsTest, DoesNotWaitToCloseThoseThatAreTooMany) {
+  const UniqueFd program = connect(list_request()), event(::eventfd(0, EFD_CLOEXEC));
+  {
+    const UniqueFd socket = lingering_socket();
+    std::vector<int> many(wire::kMaxFdsPerMessage, event.get());
+    many.push_back(socket.get());
+    send(program, "\1", many);
+  }
+  serve_without_waiting();
+  EXPECT_TRUE(is_closed(program));
+}
+
+TEST_F(ServerWithDescriptorsTest, DoesNotWaitToCloseThoseThatComeOutOfBand) {
+  const UniqueFd other = connect(list_request()), program = connect(list_request());
+  if (::send(other.get(), "\1", 1, MSG_OOB) < 0) GTEST_SKIP() << "not in this kernel";
+  send_lingering(program, "\1", MSG_OOB);
+  EXPECT_EQ(::send(program.get(), "\1", 1, 0), 1);
+  serve_without_waiting();
+}
+
+TEST_F(ServerWithDescriptorsTest, DoesNotWaitToCloseThoseOfAProgramThatItRefuses) {
+  std::vector<UniqueFd> programs;
+  for (std::uint64_t i = 0; i < kMaxClients; ++i) programs.push_back(connect(list_request()));
+  const UniqueFd refused = connect();
+  send_lingering(refused, "\1");
+  serve_without_waiting();
+  EXPECT_TRUE(is_closed(refused));
+  EXPECT_TRUE(logger.contains("programs are connected already"));
+}
+
+TEST_F(ServerWithDescriptorsTest, CountsAClientUntilItsDescriptorsAreClosed) {
+  for (std::uint64_t i = 0; i < kMaxClients; ++i) {
+    send_lingering(connect(list_request()), "\1");
+    serve_without_waiting();
+  }
+  EXPECT_EQ(service.clients(), 0U);
+  EXPECT_EQ(clients(), kMaxClients);
+  std::vector<UniqueFd> refused;
+  for (std::uint64_t i = 0; i < kMaxClients; ++i) {
+    refused.push_back(connect());
+    send_lingering(refused.back(), "\1");
+    serve_without_waiting();
+    EXPECT_TRUE(is_closed(refused.back()));
+  }
+  const UniqueFd waiting = connect(list_request());
+  EXPECT_FALSE(is_closed(waiting)) << "it is not accepted while the server has so many to close";
+  EXPECT_EQ(clients(), 2 * kMaxClients);
+
+  ends.clear();
+  run_until(loop, [&] { return service.clients() == 1; });
+  run_until(loop, [&] { return clients() == 1; });
 }
 
 }  // namespace
