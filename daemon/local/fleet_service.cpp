@@ -4,6 +4,7 @@
 #include <fmt/format.h>
 
 #include <algorithm>
+#include <new>
 #include <set>
 #include <tuple>
 #include <utility>
@@ -11,6 +12,7 @@
 #include "core/base/text.hpp"
 #include "core/base/try.hpp"
 #include "daemon/base/log.hpp"
+#include "daemon/base/memory_budget.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -342,10 +344,12 @@ const StreamInfo* FleetService::next_stream(const StreamId& id) const {
   return next;
 }
 
-// Calls `then` when all have answered, or at the timeout.
-void FleetService::ask_all(const net::Frame& request, std::function<void(Answers)> then) {
+// Calls `then` when all have answered, or at the timeout; `fail` besides when that found no memory.
+void FleetService::ask_all(const net::Frame& request, std::function<void(Answers)> then,
+                           std::function<void(const Error&)> fail) {
   const auto listing = std::make_shared<Listing>();
   listing->then = std::move(then);
+  listing->fail = std::move(fail);
   listing->deadline = loop_.deadline_in(kFreshTimeout);
   listing->unanswered = catalog_.hosts().size() + 1;  // this function is one of them until its end
   for (const auto& [id, host] : catalog_.hosts()) {
@@ -362,7 +366,12 @@ void FleetService::ask_all(const net::Frame& request, std::function<void(Answers
 void FleetService::finish(Listing& listing) {
   if (std::exchange(listing.done, true)) return;
   const auto then = std::exchange(listing.then, {});
-  then(std::exchange(listing.answers, {}));
+  const auto fail = std::exchange(listing.fail, {});
+  try {
+    then(std::exchange(listing.answers, {}));
+  } catch (const std::bad_alloc&) {  // a list may be long, and this may be a timer's callback
+    fail(no_memory_left());
+  }
 }
 
 // One in a turn of the loop: each may be long, and a program may ask for many.
@@ -382,7 +391,7 @@ void FleetService::on_list_timeout() {
 void FleetService::list(Then<std::vector<proto::Stream>> then) {
   net::Frame request;
   request.mutable_list();
-  ask_all(request, [this, then = std::move(then)](Answers answers) {
+  auto all = [this, then](Answers answers) {
     std::vector<proto::Stream> streams;
     for (const KnownHost* host : hosts_by_name()) {
       const auto answer = answers.find(host->greeting.host_id);
@@ -402,14 +411,14 @@ void FleetService::list(Then<std::vector<proto::Stream>> then) {
       if (mirror) mirror->describe(*stream.mutable_mirror());
     }
     then(std::move(streams));
-  });
+  };
+  ask_all(request, std::move(all), std::move(then));
 }
 
 void FleetService::list_nodes(NodeTable nodes, std::function<void(NodeTable)> then) {
   net::Frame request;
   request.mutable_list_nodes();
-  ask_all(request, [this, nodes = std::move(nodes),
-                    then = std::move(then)](const Answers& answers) mutable {
+  auto all = [this, nodes = std::move(nodes), then](const Answers& answers) mutable {
     for (const KnownHost* host : hosts_by_name()) {
       const std::string& name = host->greeting.host;
       const auto answer = answers.find(host->greeting.host_id);
@@ -420,6 +429,11 @@ void FleetService::list_nodes(NodeTable nodes, std::function<void(NodeTable)> th
       nodes.add_unknown(name, wire::text_untrusted(added.error().message, wire::kMaxSentenceBytes));
     }
     then(std::move(nodes));
+  };
+  ask_all(request, std::move(all), [this, then = std::move(then)](const Error& error) {
+    NodeTable none(self_.greeting.host);
+    none.add_unknown(self_.greeting.host, error.message);
+    then(std::move(none));
   });
 }
 
@@ -427,7 +441,7 @@ void FleetService::follow_playback(const proto::FollowPlayback& follow,
                                    Then<proto::PlaybackFollowers> then) {
   net::Frame request;
   *request.mutable_follow_playback() = follow;
-  ask_all(request, [this, then = std::move(then)](const Answers& answers) {
+  auto all = [this, then](const Answers& answers) {
     proto::PlaybackFollowers followers;
     for (const KnownHost* host : hosts_by_name()) {
       proto::PlaybackFollower& follower = *followers.add_followers();
@@ -440,13 +454,14 @@ void FleetService::follow_playback(const proto::FollowPlayback& follow,
       }
     }
     then(std::move(followers));
-  });
+  };
+  ask_all(request, std::move(all), std::move(then));
 }
 
 void FleetService::list_clock_pairs(std::function<void(std::vector<ClockPair>)> then) {
   net::Frame request;
   request.mutable_list_clock_pairs();
-  ask_all(request, [this, then = std::move(then)](const Answers& answers) {
+  auto all = [this, then](const Answers& answers) {
     std::vector<ClockRow> rows(1);
     rows.front().reader = self_.greeting.host;
     if (self_.clock) rows.front().pairs = self_.clock->clock_pairs();
@@ -458,6 +473,9 @@ void FleetService::list_clock_pairs(std::function<void(std::vector<ClockPair>)> 
                                     : clock_pairs_untrusted(host->greeting.host, answer->second)});
     }
     then(clock_matrix(rows));
+  };
+  ask_all(request, std::move(all), [this, then = std::move(then)](const Error& error) {
+    then({unknown_pair(self_.greeting.host, {}, error.message)});
   });
 }
 

@@ -87,6 +87,7 @@ class FleetService final : public Fleet, private CatalogObserver {
   // A request to all hosts that is under way.
   struct Listing {
     std::function<void(Answers)> then;
+    std::function<void(const Error&)> fail;  // afterwards, when `then` found no memory
     MonoTime deadline;
     Answers answers;
     std::size_t unanswered = 0;
@@ -101,7 +102,8 @@ class FleetService final : public Fleet, private CatalogObserver {
   Mirror* mirror_without_owner(const StreamId& id) const;
   std::optional<local::Response> describe_mirror(const StreamId& id) const;
   std::vector<const KnownHost*> hosts_by_name() const;
-  void ask_all(const net::Frame& request, std::function<void(Answers)> then);
+  void ask_all(const net::Frame& request, std::function<void(Answers)> then,
+               std::function<void(const Error&)> fail);
   static void finish(Listing& listing);
   void on_list_timeout();
 

@@ -218,8 +218,11 @@ LocalRequests::Answer LocalService::await(ClientNumber number, std::uint64_t ser
     return {};
   }
   ++client.awaited;
-  return [this, number, serial](Result<Reply> reply) {
-    if (const auto asker = clients_.find(number); asker != clients_.end()) --asker->second.awaited;
+  // One for which there was no memory is followed by a failure.
+  const auto is_awaited = std::make_shared<bool>(true);
+  return [this, number, serial, is_awaited](Result<Reply> reply) {
+    const auto asker = clients_.find(number);
+    if (std::exchange(*is_awaited, false) && asker != clients_.end()) --asker->second.awaited;
     on_answer(number, serial, std::move(reply));
   };
 }

@@ -7,6 +7,7 @@
 #include <gtest/gtest.h>
 
 #include <filesystem>
+#include <new>
 
 #include "tests/support/log_recorder.hpp"
 #include "tests/unit/daemon/clock/fake_chronyd.hpp"
@@ -163,6 +164,17 @@ TEST_F(FleetServiceTest, AnswersOneOfManyListsInATurnWhenAHostDoesNotAnswer) {
     run_until(loop, [&] { return answers > 0; });
     EXPECT_EQ(std::exchange(answers, 0), 1);
   }
+}
+
+TEST_F(FleetServiceTest, FailsAListForWhichThereIsNoMemory) {
+  run_until(loop, [this] { return catalog.hosts().size() == 2; });
+  std::optional<Error> failed;
+  fleet->list([&](const Result<std::vector<proto::Stream>>& streams) {
+    if (streams) throw std::bad_alloc();
+    failed = streams.error();
+  });
+  run_until(loop, [&] { return failed.has_value(); });
+  EXPECT_EQ(failed->code, Errc::no_memory);
 }
 
 // --- nodes

@@ -353,6 +353,17 @@ TEST_F(RemoteRequestsTest, BoundsWhatOneClientWaitsFor) {
   EXPECT_TRUE(client->received.empty()) << "there is room again";
 }
 
+// There was no memory to send it.
+TEST_F(RemoteRequestsTest, CountsARequestOnceWhoseAnswerIsFollowedByAFailure) {
+  put(list_request(), 50);
+  fleet.list_then.at(0)(std::vector<proto::Stream>());
+  fleet.list_then.at(0)(Error{Errc::no_memory, "no memory left"});
+  EXPECT_TRUE(client->next().has_stream_list());
+  EXPECT_EQ(client->next().failure().code(), "no_memory");
+  put(list_request(), 51);
+  EXPECT_TRUE(client->received.empty()) << "it waits for an answer";
+}
+
 // --- changes
 
 TEST_F(RemoteRequestsTest, NotifiesWatchersOfTheStreamsOfAllHosts) {
