@@ -139,8 +139,10 @@ Result<void> LocalService::check_access(const Client& client, const local::Reque
   return checked;
 }
 
+// Whether a Create of `id` finds the stream; without a host it is searched here only.
 bool LocalService::exists(const StreamId& id) const {
-  return registry_.knows(id) || (fleet_ && fleet_->is_there(id));
+  if (id.host.empty() || id.host == registry_.host()) return registry_.knows(id);
+  return fleet_ && fleet_->is_there(id);
 }
 
 bool LocalService::is_only_user(const Client& client, const StreamId& id) const {

@@ -28,7 +28,7 @@ struct LocalDaemon {
   Registry registry{"pc1", kLimits};
   OpenTable opens;
   PlaybackClockOwner clock;
-  const Rights rights;
+  Rights rights;
   LocalService service;
 };
 

@@ -364,6 +364,30 @@ TEST_F(RemoteRequestsTest, CountsARequestOnceWhoseAnswerIsFollowedByAFailure) {
   EXPECT_TRUE(client->received.empty()) << "it waits for an answer";
 }
 
+// --- rights
+
+class RemoteRightsTest : public RemoteRequestsTest {
+ protected:
+  void allow(const std::string& line) { rights.set({parse_right(line).value()}); }
+  static local::Request create_at(const std::string& host) {
+    local::Request request = create_request("lidar");
+    request.mutable_create()->mutable_id()->set_host(host);
+    return request;
+  }
+};
+
+TEST_F(RemoteRightsTest, CreateNothingHereBecauseAnotherHostHasAStreamOfThatName) {
+  fleet.there = {"lidar:0", "lidar:0@pc1", "lidar:0@pc2"};
+  allow("user:1000 write lidar");
+  for (const char* host : {"", "pc1"}) {
+    const proto::Failure refused = client->ask(create_at(host)).failure();
+    EXPECT_EQ(refused.code(), "no_permission") << host;
+    EXPECT_NE(refused.message().find("may not create"), std::string::npos) << refused.message();
+  }
+  EXPECT_TRUE(registry.streams().empty());
+  EXPECT_TRUE(fleet.asked.empty());
+}
+
 // --- changes
 
 TEST_F(RemoteRequestsTest, NotifiesWatchersOfTheStreamsOfAllHosts) {
