@@ -51,9 +51,10 @@ void ChannelClient::open(const StreamId& id, const CreatePlan* plan) {
   open_serial_ = next_serial();
   net::Frame frame;
   frame.set_serial(open_serial_);
-  if (plan) {
+  if (plan && plan->scope != CreatePlan::Scope::join) {
     wire::to_message(id, plan->type, plan->history, *frame.mutable_create());
-    frame.mutable_create()->set_keep_existing(plan->keep_existing);
+    frame.mutable_create()->set_keep_existing(plan->keep_existing ||
+                                              plan->scope != CreatePlan::Scope::replace);
   } else {
     wire::to_message(id, *frame.mutable_open()->mutable_id());
   }

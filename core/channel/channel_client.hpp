@@ -91,6 +91,9 @@ struct CreatePlan {
   TypeInfo type;
   History history;
   bool keep_existing = false;  // as in proto::Create
+  // How far the request goes. join: opens a stream that is there, and whoever asks checks that it
+  // fits; create: also makes one that is missing; replace: also one that does not fit.
+  enum class Scope : std::uint8_t { join, create, replace } scope = Scope::replace;
 };
 
 // A value; one thread. Its functions call the delegate, which may call open(), subscribe(),

@@ -285,12 +285,25 @@ void LocalRequests::create_elsewhere(const Client& client, const StreamId& id,
   const Result<TypeInfo> type = wire::type_untrusted(request.type());
   if (!type) return answer(type.error());
   if (Result<void> quota = opens_.check_quota(*client); !quota) return answer(quota.error());
-  const CreatePlan plan{
-      *type, {request.depth(), Duration(request.cycle_ns())}, request.keep_existing()};
+  CreatePlan plan{*type, {request.depth(), Duration(request.cycle_ns())}, request.keep_existing()};
+  // The owner decides only about this host, which may do more than this program.
+  const Result<void> creates = rights_.check(*client, Action::create, id);
+  if (!creates) {
+    plan.scope = CreatePlan::Scope::join;
+  } else if (!rights_.check(*client, Action::remove, id)) {
+    plan.scope = CreatePlan::Scope::create;
+  }
   fleet_->open_writer(
       id, &plan, client->account(),
-      [this, client, tag = request.tag(), answer = std::move(answer)](Result<OpenedRing> writer) {
-        if (!writer) return answer(std::move(writer).error());
+      [this, client, creates, tag = request.tag(),
+       answer = std::move(answer)](Result<OpenedRing> writer) {
+        if (!writer) {
+          Error error = std::move(writer).error();
+          if (!creates && error.code == Errc::not_found) {
+            error.message += "; " + creates.error().message;
+          }
+          return answer(std::move(error));
+        }
         Result<Reply> reply = opened({client, writer->stream, Role::writer, tag, false});
         if (reply) reply->response.mutable_opened()->set_created(writer->created);
         answer(std::move(reply));

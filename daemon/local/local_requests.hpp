@@ -74,7 +74,8 @@ class Fleet {
   virtual void want_history(const StreamId& id, bool always) = 0;
 
   // A ring of this host that is published into the other host's stream.
-  //   plan  create the stream there unless it exists, `id` names the host; nullptr: it must exist
+  //   plan  create the stream there unless it exists, `id` names the host; nullptr: it must exist,
+  //         as with a plan that is only to join it
   virtual void open_writer(const StreamId& id, const CreatePlan* plan, const std::string& account,
                            Then<OpenedRing> then) = 0;
 

@@ -153,11 +153,14 @@ Result<void> RemoteWriter::check_open(const CreatePlan* plan) {
   DSSM_TRY(ring_->stream()->type().check_usable_as(plan->type), context);
   if (!plan->keep_existing && plan->history.depth > history_.depth) {
     return Error{Errc::conflict,
-                 fmt::format("{}: its ring has {} slots, and this program asks for {}; another "
-                             "program of this PC writes it: end that one, or ask for less",
-                             context, history_.depth, plan->history.depth)};
+                 fmt::format("{}: its ring has {} slots, and this program asks for {}; {}ask for "
+                             "less",
+                             context, history_.depth, plan->history.depth,
+                             plan->scope == CreatePlan::Scope::replace
+                                 ? "another program of this PC writes it: end that one, or "
+                                 : "dssmd's key 'rights' does not allow it to replace the ring: ")};
   }
-  creates_ = true;
+  if (plan->scope != CreatePlan::Scope::join) creates_ = true;
   return {};
 }
 

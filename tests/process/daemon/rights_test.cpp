@@ -141,6 +141,37 @@ TEST_F(RightsProcess, AStreamThatIsGivenBackNeedsThemToo) {
   EXPECT_EQ(own.stream_info({"lidar", 0, ""}).error().code, Errc::not_found);
 }
 
+TEST_F(RightsProcess, WhoMayOnlyWriteReplacesNothingOnAnotherHost) {
+  const DaemonProcess pc2({}, "pc2");
+  daemon_.emplace(std::vector<std::string>{"--config", path_, "--listen", "", "--socket-mode",
+                                           "0666", "--peer", pc2.address()});
+  ASSERT_EQ(::chmod(daemon_->runtime_dir().c_str(), 0755), 0);
+  reload("user:nobody write lidar");
+  as_nobody({}, [&](const Tell& tell) {
+    Session own = session();
+    await([&] { return own.list_streams().value().size() == 1; });
+    const StreamId lidar{"lidar", 0, "pc2"};
+    tell(outcome(own.create_raw(lidar, type_of<float>(), {4, Duration(1)})));
+    tell(outcome(own.create_raw(lidar, number_type(), {5, Duration(1)})));
+    tell(outcome(own.create_raw(lidar, number_type(), {4, Duration(1)})));
+    tell(outcome(own.create_raw({"lidar", 0, ""}, number_type(), {4, Duration(1)})));
+    ::pause();
+  });
+  Session there = Session::connect({.socket_path = pc2.socket_path()}).value();
+  const StreamId lidar{"lidar", 0, ""};
+  ASSERT_TRUE(there.create_raw(lidar, number_type(), {4, Duration(1)}));
+  const std::uint64_t ring = there.stream_info(lidar).value().incarnation;
+  const auto heard_code = [&] {
+    const std::string line = heard();
+    return line.substr(0, line.find(' '));
+  };
+  EXPECT_EQ(heard_code(), "type_mismatch");
+  EXPECT_EQ(heard_code(), "conflict") << "it is shorter";
+  EXPECT_EQ(heard_code(), "created") << "it fits: the program joins it";
+  EXPECT_EQ(heard_code(), "no_permission") << "here is none";
+  EXPECT_EQ(there.stream_info(lidar).value().incarnation, ring) << "nothing took its place";
+}
+
 TEST_F(RightsProcess, AReaderIsToldThatItMayNotReadAnyMore) {
   reload("local read *");
   // Before this process has a session, whose thread the child would not have.

@@ -5,6 +5,7 @@
 #include <gtest/gtest.h>
 
 #include <algorithm>
+#include <optional>
 #include <set>
 #include <tuple>
 
@@ -39,6 +40,7 @@ class FakeFleet final : public Fleet {
                    Then<OpenedRing> then) override {
     asked.push_back("open_writer " + id.str() +
                     (plan ? " depth " + std::to_string(plan->history.depth) : ""));
+    writer_plan = plan ? std::optional(*plan) : std::nullopt;
     writer_then = std::move(then);
   }
   Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role role, OfferedFiles files,
@@ -121,6 +123,7 @@ class FakeFleet final : public Fleet {
   std::vector<std::string> asked;
   Then<std::shared_ptr<Stream>> reader_then;
   Then<OpenedRing> writer_then;
+  std::optional<CreatePlan> writer_plan;
   std::vector<Then<std::vector<proto::Stream>>> list_then;
   std::vector<StreamInfo> known;  // in the order of hosts, names and ids
   std::vector<ClockPair> pairs;
@@ -386,6 +389,35 @@ TEST_F(RemoteRightsTest, CreateNothingHereBecauseAnotherHostHasAStreamOfThatName
   }
   EXPECT_TRUE(registry.streams().empty());
   EXPECT_TRUE(fleet.asked.empty());
+}
+
+TEST_F(RemoteRightsTest, ReachAsFarAtAnotherHostAsHere) {
+  using Scope = CreatePlan::Scope;
+  fleet.there = {"lidar:0@pc2"};
+  const std::pair<const char*, Scope> expected[] = {{"write", Scope::join},
+                                                    {"write,remove", Scope::join},
+                                                    {"create", Scope::create},
+                                                    {"create,remove", Scope::replace}};
+  for (const auto& [verbs, scope] : expected) {
+    allow(std::string("user:1000 ") + verbs + " lidar");
+    put(create_at("pc2"));
+    ASSERT_TRUE(fleet.writer_plan) << verbs;
+    EXPECT_EQ(fleet.writer_plan->scope, scope) << verbs;
+    EXPECT_FALSE(fleet.writer_plan->keep_existing) << verbs;
+    fleet.writer_then(OpenedRing{fleet.ring("lidar"), false});
+    EXPECT_TRUE(client->next().has_opened()) << verbs;
+  }
+}
+
+// The catalog still had it.
+TEST_F(RemoteRightsTest, SayWhyAStreamThatHasGoneIsNotCreated) {
+  fleet.there = {"lidar:0@pc2"};
+  allow("user:1000 write lidar");
+  put(create_at("pc2"));
+  fleet.writer_then(Error{Errc::not_found, "there is no stream 'lidar:0@pc2'"});
+  const proto::Failure failure = client->next().failure();
+  EXPECT_EQ(failure.code(), "not_found");
+  EXPECT_NE(failure.message().find("may not create"), std::string::npos) << failure.message();
 }
 
 // --- changes

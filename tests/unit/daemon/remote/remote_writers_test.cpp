@@ -164,6 +164,41 @@ TEST_F(RemoteWritersTest, ChecksTheTypeOfThoseWhoJoin) {
   EXPECT_TRUE(open(&plan)->has_value());
 }
 
+TEST_F(RemoteWritersTest, NeverCreatesTheStreamForAProgramThatMayOnlyJoinIt) {
+  plan.scope = CreatePlan::Scope::join;
+  const auto answer = open(&plan);
+  const net::Frame request = owner->receive();
+  EXPECT_TRUE(request.has_open());
+  owner->send(opened_frame(request, theirs));
+  publishing(owner->receive(), -1);
+  const OpenedRing writer = wait(answer);
+  owner->cut();
+  EXPECT_TRUE(owner->receive().has_open()) << "nor after a cut";
+}
+
+TEST_F(RemoteWritersTest, ChecksItselfWhatTheOwnerMayNotReplace) {
+  using Scope = CreatePlan::Scope;
+  CreatePlan deeper = plan, other = plan, keeping = plan;
+  deeper.history.depth = theirs.depth + 1;
+  other.type = {"Other", 24, 8, {}};
+  keeping.history.depth = deeper.history.depth;
+  keeping.keep_existing = true;
+  for (const Scope scope : {Scope::join, Scope::create}) {
+    deeper.scope = other.scope = keeping.scope = scope;
+    const auto too_short = open(&deeper), of_other_type = open(&other), fits = open(&keeping);
+    const net::Frame request = owner->receive();
+    EXPECT_EQ(request.has_open(), scope == Scope::join);
+    EXPECT_EQ(request.create().keep_existing(), scope == Scope::create);
+    owner->send(opened_frame(request, theirs));
+    publishing(owner->receive(), -1);
+    EXPECT_EQ(wait_error(too_short).code, Errc::conflict);
+    EXPECT_EQ(wait_error(of_other_type).code, Errc::type_mismatch);
+    static_cast<void>(wait(fits));
+    fits->reset();
+    wait_until_none();
+  }
+}
+
 TEST_F(RemoteWritersTest, FailsWithAReasonWhenTheOwnerDoesNotAnswer) {
   const KnownHost host = owner->host();
   owner.reset();
