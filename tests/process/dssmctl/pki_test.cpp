@@ -310,6 +310,18 @@ TEST_F(Pki, RevokeTakesOneCertificateOrAllOfAName) {
   refused({"revoke", "pc9", "--ca", ca_}, "'pc9'");
 }
 
+TEST_F(Pki, RevokeTakesWhatHasEndedToo) {
+  NEEDS_OPENSSL();
+  const std::string csr = folder_ + "/pc2.csr";
+  std::ofstream(csr) << request(host_);
+  const Finished made =
+      run({"openssl", "x509", "-req", "-in", csr, "-CA", ca_ + "/ca.crt", "-CAkey", ca_ + "/ca.key",
+           "-set_serial", "4711", "-days", "-1", "-out", ca_ + "/issued/ended.pem"});
+  ASSERT_EQ(made.exit_status, 0) << made.err;
+  must({"revoke", "pc2", "--ca", ca_});
+  EXPECT_EQ(show(ca_)["revocation_lists"][0]["revoked"], 1);
+}
+
 TEST_F(Pki, RevocationsAtTheSameTimeAreAllInTheList) {
   const std::vector<std::string> names = {"a", "b", "c", "d", "e", "f"};
   for (const std::string& name : names) issue(request(host_, "--program", name));
