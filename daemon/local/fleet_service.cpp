@@ -548,7 +548,7 @@ local::Mdns FleetService::mdns() const {
 }
 
 void FleetService::ping(const std::string& host, Then<local::RoundTrip> then) {
-  when_known({"", 0, host}, 0, [this, host, then = std::move(then)]() mutable {
+  when_known({"", 0, host}, host.size(), [this, host, then = std::move(then)]() mutable {
     const Result<const KnownHost*> known = catalog_.find_host(host);
     if (!known) return then(with_unavailable_peers(known.error()));
     PeerConnection& link = *peers_.connection_to((*known)->greeting.host_id);

@@ -85,6 +85,17 @@ TEST_F(FleetServiceTest, BoundsWhatWaitsForThePeers) {
   EXPECT_EQ(requests, FleetService::kMaxEarlyBytes >> 20);
 }
 
+TEST_F(FleetServiceTest, BoundsTheNamesOfHostsThatWaitForThePeers) {
+  constexpr std::size_t kNameBytes = 1U << 20;
+  std::size_t requests = 0;
+  bool is_answered = false;
+  for (; !is_answered && requests < 100; ++requests) {
+    fleet->ping(std::string(kNameBytes, 'x'),
+                [&](const Result<local::RoundTrip>&) { is_answered = true; });
+  }
+  EXPECT_EQ(requests, FleetService::kMaxEarlyBytes / kNameBytes + 1);
+}
+
 TEST_F(FleetServiceTest, ReportsTheNewestStateOfMdns) {
   MdnsInfo state;
   state.phase = MdnsPhase::waiting;
