@@ -108,6 +108,17 @@ Result<std::vector<RevocationList>> lists_to_install(const PkiInstallOptions& op
   std::vector<RevocationList> all = DSSM_TRY(read_bundle_if_there(path)).lists;
   all.insert(all.end(), bundle.lists.begin(), bundle.lists.end());
   std::vector<RevocationList> newest = newest_lists(authorities, all);
+  for (const Certificate& ca : authorities) {
+    const std::string name = identity_of(ca).name;
+    if (newest.empty() || std::any_of(newest.begin(), newest.end(),
+                                      [&](const auto& list) { return issuer_of(list) == name; })) {
+      continue;
+    }
+    return wrong_bundle(options, fmt::format("there is no revocation list of '{}', and dssmd needs "
+                                             "one of each CA; append 'revoked.crl' of that CA to "
+                                             "what is installed",
+                                             escaped(name)));
+  }
   for (const RevocationList& list : bundle.lists) {
     if (std::any_of(newest.begin(), newest.end(), [&](const RevocationList& other) {
           return issuer_of(other) == issuer_of(list) && is_newer(other, list);

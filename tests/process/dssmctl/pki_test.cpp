@@ -216,6 +216,18 @@ TEST_F(Pki, InstallRefusesACertificateThatHasEnded) {
   refused({"install", "-", "--credentials", host_}, "clock", made.out + contents(ca_ + "/ca.crt"));
 }
 
+// dssmd would not start with it.
+TEST_F(Pki, InstallRefusesListsOfSomeOfItsCasOnly) {
+  const std::string other_ca = folder_ + "/ca2";
+  must({"init", "--ca", other_ca, "--name", "truck2"});
+  const std::string bundle = issue(request(host_)) + contents(other_ca + "/ca.crt");
+  refused({"install", "-", "--credentials", host_}, "no revocation list of 'DSSM CA of truck2'",
+          bundle);
+  EXPECT_FALSE(std::filesystem::exists(host_ + "/ca.crt"));
+  install(bundle + contents(other_ca + "/revoked.crl"));
+  EXPECT_EQ(show(host_)["revocation_lists"].size(), 2u);
+}
+
 TEST_F(Pki, ACaWorksOnlyWithTheListOfWhatItRevoked) {
   const std::string csr = request(host_);
   const std::string list = ca_ + "/revoked.crl";
