@@ -207,6 +207,10 @@ TEST_F(Record, OpensAStreamAgainThatHasAnotherType) {
   Running running(argv({"record", "-o", file_}), environment());
   await_reader(pose->id());
   write_poses(*pose, 0, 9);
+  await([&] {  // dssmd counts the reader before the recorder has the ring
+    const Result<Recording> recording = Recording::open(file_);
+    return recording && recording->streams().size() == 1 && recording->streams()[0].samples == 10;
+  });
   ASSERT_TRUE(session_.remove(pose->id()));
   pose.reset();
   auto number = session_.create<double>("pose", depth_of(64)).value();
