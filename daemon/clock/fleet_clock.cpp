@@ -347,7 +347,7 @@ void FleetClock::update_line(RawTime now) {
   wire::ClockReport& own = *own_;
   clock::ClockLine& line = own.line;
   const clock::ClockReading reading = clock::ClockReading::now();
-  if (line.holds() && now - line.raw < kLineAge) {
+  if ((line.shows(reading) || line.holds()) && now - line.raw < kLineAge) {
     // One that was drawn while reading the clocks took long would stay all the longer. Other hosts
     // get the better one with the next heartbeat: the one that they have holds as well.
     const clock::ClockLine better = clock::ClockLine::through(reading, line.rate);

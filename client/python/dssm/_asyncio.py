@@ -50,7 +50,7 @@ class _Ready:
         self._call(self._stop_waiting)
 
     def on_closed(self) -> None:
-        """After that: a task that were woken before would find it open, and wait again."""
+        """After it was closed: a task that wakes up earlier finds it open, and waits again."""
         self._call(self.event.set)
 
     def _call(self, function: Callable[[], None]) -> None:

@@ -19,9 +19,9 @@ const kUrlMs = 300;
 const kTypeRetryMs = 2000;
 const kStepMs = 100; // where no stream is shown
 const kMaxMarginNs = 1000000000n; // from the oldest sample of a ring that is being written
-// What is said of a stream that has a sample at an instant, or may have.
-const kMayHaveOne = ["ok", "opening", "arriving", "lapped", "restarted"];
 const kMaxSteps = 12; // requests for one step
+// Statuses of a stream that has a sample at an instant, or may have one.
+const kMayHaveOne = ["ok", "opening", "arriving", "lapped", "restarted"];
 
 const find = (id) => document.getElementById(id);
 const scheme = location.protocol === "https:" ? "wss" : "ws";
@@ -155,7 +155,7 @@ function beginning() {
 function playOn() {
   if (time.recorded || !time.range) return;
   const first = beginning();
-  time.playFrom(first > time.t ? first : time.t + marginOf(time.range.newest - time.t));
+  time.set("play", first > time.t ? first : time.t + marginOf(time.range.newest - time.t));
 }
 
 // "host pc2 is down"; empty for a host that answers.

@@ -72,11 +72,6 @@ export class Time extends EventTarget {
     }, kPlayMs);
   }
 
-  // Continues there.
-  playFrom(t) {
-    this.set("play", t);
-  }
-
   toggle() {
     if (this.mode !== "hold") this.hold();
     else if (this.recorded) this.play();

@@ -13,6 +13,7 @@
 
 #include "core/wire/local_protocol.hpp"
 #include "tests/process/daemon/raw_client.hpp"
+#include "tests/support/descriptors.hpp"
 
 namespace dssm::test {
 namespace {
@@ -100,22 +101,7 @@ TEST_F(BadClient, ThatSendsAnUnknownRequestIsAnsweredAndStaysConnected) {
 TEST_F(BadClient, ThatSendsTooManyDescriptorsAtOnceIsRefused) {
   RawClient client(daemon_.socket_path());
   const int null = ::open("/dev/null", O_RDWR | O_CLOEXEC);
-  // By hand: our own send_some() would not.
-  const std::vector<int> flood(200, null);
-  std::vector<std::byte> control(CMSG_SPACE(flood.size() * sizeof(int)));
-  char byte = 1;
-  iovec part{&byte, 1};
-  msghdr message{};
-  message.msg_iov = &part;
-  message.msg_iovlen = 1;
-  message.msg_control = control.data();
-  message.msg_controllen = control.size();
-  cmsghdr* header = CMSG_FIRSTHDR(&message);
-  header->cmsg_level = SOL_SOCKET;
-  header->cmsg_type = SCM_RIGHTS;
-  header->cmsg_len = CMSG_LEN(flood.size() * sizeof(int));
-  std::memcpy(CMSG_DATA(header), flood.data(), flood.size() * sizeof(int));
-  ASSERT_EQ(::sendmsg(client.fd(), &message, MSG_NOSIGNAL), 1);
+  ASSERT_TRUE(send_descriptors(client.fd(), "\1", std::vector<int>(200, null)));
   EXPECT_NE(final_failure(client).find("descriptors"), std::string::npos);
   ::close(null);
 }

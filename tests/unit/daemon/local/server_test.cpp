@@ -16,6 +16,7 @@
 #include "core/wire/frame.hpp"
 #include "core/wire/local_protocol.hpp"
 #include "tests/support/daemon_process.hpp"
+#include "tests/support/descriptors.hpp"
 #include "tests/unit/daemon/local/fake_client.hpp"
 #include "tests/unit/daemon/run_loop.hpp"
 
@@ -215,22 +216,9 @@ class ServerWithDescriptorsTest : public ServerTest {
     return socket;
   }
 
-  static void send(const UniqueFd& program, std::string bytes, const std::vector<int>& descriptors,
-                   int flags = 0) {
-    const std::size_t length = descriptors.size() * sizeof(int);
-    std::vector<char> control(CMSG_SPACE(length));
-    iovec part{bytes.data(), bytes.size()};
-    msghdr message{};
-    message.msg_iov = &part;
-    message.msg_iovlen = 1;
-    message.msg_control = control.data();
-    message.msg_controllen = control.size();
-    cmsghdr* header = CMSG_FIRSTHDR(&message);
-    header->cmsg_level = SOL_SOCKET;
-    header->cmsg_type = SCM_RIGHTS;
-    header->cmsg_len = CMSG_LEN(length);
-    std::memcpy(CMSG_DATA(header), descriptors.data(), length);
-    EXPECT_EQ(::sendmsg(program.get(), &message, MSG_NOSIGNAL | flags), std::ssize(bytes));
+  static void send(const UniqueFd& program, const std::string& bytes,
+                   const std::vector<int>& descriptors, int flags = 0) {
+    EXPECT_TRUE(test::send_descriptors(program.get(), bytes, descriptors, flags));
   }
   // The same of one that only the server has afterwards.
   void send_lingering(const UniqueFd& program, const std::string& bytes, int flags = 0) {
