@@ -618,6 +618,16 @@ TEST_F(FleetClockTest, ChecksThisClockBeforeItStatesPairs) {
   EXPECT_TRUE(own->line.exists());
 }
 
+TEST_F(FleetClockTest, ReplacesALineWithMuchToleranceByABetterOneWithin) {
+  start();
+  const auto reading = clock::ClockReading::now();
+  own->line = {reading.raw, reading.wall, 0, 50ms};  // as if reading the clocks took so long
+  const int before = generations;
+  fleet->set(policies, 50'000);
+  EXPECT_LT(own->line.tolerance, 50ms * 3 / 4);
+  EXPECT_EQ(generations, before) << "the line that the others have holds as well";
+}
+
 TEST_F(FleetClockTest, StatesTheErrorOfItsSamplesEvenWhereItsClockIsNear) {
   add_follower(1200us);
   start();
