@@ -97,6 +97,14 @@ Finding no_permission(const Facts& facts) {
                              facts.user, group),
                  fmt::format("newgrp {}  # or log in again", group));
   }
+  // Its members may change files of the system: it is not a group to join for this.
+  if (group == "root") {
+    return found(
+        "root started dssmd without --socket-group, so only root may use it",
+        fmt::format("sudo groupadd --force --system {0}; sudo usermod -aG {0} {1}  # then log "
+                    "in again, and start dssmd with --socket-group {0}",
+                    kDefaultGroup, facts.user));
+  }
   return found(fmt::format("user '{}' is not in the socket's group '{}'", facts.user, group),
                fmt::format("sudo usermod -aG {} {}  # then log in again", group, facts.user));
 }
@@ -573,8 +581,10 @@ Finding host_refused(const HostInfo& host) {
       return found("both hosts have the same name",
                    rename_command(host.name) + "  # on one of them");
     default:
-      return found("the two do not fit together: versions, names or limits",
-                   "dssmctl hosts  # shows the reason; install the same version of DSSM on both");
+      return found(
+          "the two do not fit together: certificates, versions, names or limits",
+          "dssmctl hosts  # shows the reason; a certificate or TLS: `dssmctl pki show` on both; "
+          "a version: install the same version of DSSM on both");
   }
 }
 

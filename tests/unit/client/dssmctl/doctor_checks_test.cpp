@@ -131,6 +131,9 @@ TEST(Doctor, ReportsWhichPermissionIsMissing) {
   EXPECT_FINDING(facts, "daemon", Status::fail, "usermod -aG dssm anna");
   facts.socket.group = "robots";
   EXPECT_FINDING(facts, "daemon", Status::fail, "usermod -aG robots anna");
+  facts.socket.group = "root";  // nobody is to join that
+  EXPECT_FINDING(facts, "daemon", Status::fail, "usermod -aG dssm anna");
+  EXPECT_FINDING(facts, "daemon", Status::fail, "--socket-group dssm");
 }
 
 TEST(Doctor, LeavesOutWhatOnlyDssmdKnowsWhileItIsDown) {
