@@ -206,7 +206,9 @@ Result<Bundle> parse_bundle_untrusted(std::string_view pem) {
   unsigned char* bytes = nullptr;
   long size = 0;
   Result<void> taken;
+  bool has_request = false;
   while (taken && PEM_read_bio(bio.get(), &type, &header, &bytes, &size) == 1) {
+    if (std::string_view(type) == PEM_STRING_X509_REQ) has_request = true;
     taken = take_block(bundle, type, bytes, size);
     OPENSSL_free(type);
     OPENSSL_free(header);
@@ -217,7 +219,9 @@ Result<Bundle> parse_bundle_untrusted(std::string_view pem) {
   if (!taken) return std::move(taken).error();
   if (reason != PEM_R_NO_START_LINE) return bad_content("it is not whole, or not PEM");
   if (bundle.certificates.empty() && bundle.lists.empty()) {
-    return bad_content("it contains neither a certificate nor a revocation list");
+    return bad_content(has_request
+                           ? "it is a request; `dssmctl pki issue` makes a certificate of it"
+                           : "it contains neither a certificate nor a revocation list");
   }
   return bundle;
 }

@@ -198,6 +198,7 @@ TEST_F(Pki, InstallRefusesWhatDoesNotFit) {
   refused(install_here, "revocation list of 'DSSM CA of truck' was not signed",
           own + contents(ca_ + "/ca.crt") + contents(other_ca + "/revoked.crl"));
   refused(install_here, "neither a certificate nor", "nonsense");
+  refused(install_here, "it is a request; `dssmctl pki issue`", csr);
   refused(install_here, "ca.crt", contents(ca_ + "/revoked.crl"));
   EXPECT_FALSE(std::filesystem::exists(host_ + "/own.crt"));
 
