@@ -152,10 +152,11 @@ Result<const KnownHost*> Catalog::find_host(const std::string& name) const {
   if (found.size() == 1) return found.front();
   if (found.empty()) {
     const std::string known =
-        hosts_.empty() ? "no other host answers" : "those that answer are " + host_names();
-    return Error{Errc::not_found, fmt::format("there is no host '{}': {}; see `dssmctl hosts`, and "
-                                              "add it to the key peers if it is missing there",
-                                              name, known)};
+        hosts_.empty() ? ", and no other host answers" : ": those that answer are " + host_names();
+    return Error{Errc::not_found,
+                 fmt::format("no host '{}' answers{}; see `dssmctl hosts`, and add "
+                             "it to the key peers if it is missing there",
+                             name, known)};
   }
   std::string addresses;
   for (const KnownHost* host : found) {
