@@ -65,7 +65,7 @@ void StderrLogger::write(LogLevel level, std::string_view text, const LogFields&
     line.append("dssmd: ").append(level_word(level));
   }
   line += printable(text);
-  if (!fields.peer.empty()) line.append(" [client ").append(printable(fields.peer)).append("]");
+  if (!fields.peer.empty()) line.append(" [peer ").append(printable(fields.peer)).append("]");
   if (left_out_ > 0) line += fmt::format(" ({} lines before this one are lost)", left_out_);
   left_out_ = 0;
   line.resize(std::min(line.size(), kMaxLineBytes - 1));

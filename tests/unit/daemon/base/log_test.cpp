@@ -29,7 +29,7 @@ TEST(StderrLogger, LeavesOutWhatIsBelowItsLevel) {
 
 TEST(StderrLogger, NamesThePeerAndDoesNotLetItForgeLines) {
   EXPECT_EQ(logged(LogLevel::info, false, LogLevel::info, "came", {.peer = "x\ndssmd: y"}),
-            "dssmd: came [client x?dssmd: y]\n");
+            "dssmd: came [peer x?dssmd: y]\n");
 }
 
 }  // namespace
