@@ -413,7 +413,8 @@ Result<toml::table> parse_toml(std::string_view text, const std::string& path) {
     return toml::parse(text, path);
   } catch (const toml::parse_error& error) {
     return Error{Errc::invalid_argument,
-                 place(path, error.source()) + std::string(error.description())};
+                 place(path, error.source()) + std::string(error.description()) +
+                     "; texts are in quotes, as in name = \"pc1\", and lists in brackets"};
   }
 }
 

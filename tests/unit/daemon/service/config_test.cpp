@@ -284,6 +284,7 @@ TEST(Config, ReportsAllMistakesInTheOrderOfTheFile) {
 
 TEST(Config, NamesTheLineOfASyntaxError) {
   EXPECT_EQ(mistakes_in("name = \"pc1\"\nmax_streams = = 3\n").find("dssmd.conf:2: "), 0u);
+  EXPECT_NE(mistakes_in("name = pc1\n").find("texts are in quotes"), std::string::npos);
   EXPECT_NE(mistakes_in("name = \"\xff\"\n"), "");
 }
 
