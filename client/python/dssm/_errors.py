@@ -148,6 +148,7 @@ class Overwritten(ReadError):
 
 
 def _subclasses(error: type[Error]) -> dict[str, type[Error]]:
+    error.__module__ = "dssm"  # tracebacks show the name that programs use
     found = {error.code: error}
     for each in error.__subclasses__():
         found |= _subclasses(each)

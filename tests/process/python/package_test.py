@@ -77,6 +77,7 @@ class Package(unittest.TestCase):
         for code in codes | statuses - {"ok"}:
             with self.subTest(code=code):
                 self.assertEqual(dssm._errors.by_code(code).code, code)
+                self.assertEqual(dssm._errors.by_code(code).__module__, "dssm")
 
     def test_the_installed_package_is_complete(self):
         """Installs into a folder, and imports the package from it."""
