@@ -163,6 +163,7 @@ class Player {
       }
     }
     if (targets_.empty()) return nothing_fits();
+    DSSM_TRY(check_mappings());
     for (const Target& target : targets_) DSSM_TRY(check_writers(target.id));
     if (!options_.lockstep.empty()) {
       // All is the same each time, also what the rings hold at first.
@@ -293,14 +294,19 @@ class Player {
     friend bool operator==(const Property&, const Property&) = default;
   };
 
-  Error nothing_fits() const {
+  // "'climate', 'pose'": of all streams of the recording.
+  std::string streams_text() const {
     constexpr std::size_t kMaxNamed = 20;
     std::vector<std::string> names;
     for (const RecordedStreamInfo& stream : recording_.streams()) {
       std::string name = stream.id.str();
       if (std::ranges::find(names, name) == names.end()) names.push_back(std::move(name));
     }
-    const std::string there = list_text(names, kMaxNamed);
+    return list_text(names, kMaxNamed);
+  }
+
+  Error nothing_fits() const {
+    const std::string there = streams_text();
     if (options_.patterns.empty()) {
       return {Errc::not_found,
               fmt::format("'{}' has only streams of the black box, {}; they are played if a "
@@ -336,25 +342,46 @@ class Player {
     const auto names_it = [&](const std::string& pattern) {
       return pattern.starts_with("dssm_") && StreamFilter({}, {pattern}).takes(id);
     };
-    const auto maps_it = [&](const std::string& mapping) {
-      return StreamFilter({}, {mapping.substr(0, mapping.find('='))}).takes(id);
-    };
     return std::ranges::any_of(options_.patterns, names_it) ||
-           std::ranges::any_of(options_.mappings, maps_it);
+           mapping_of(id) != options_.mappings.end();
+  }
+
+  static bool takes(const std::string& mapping, const StreamId& id) {
+    return StreamFilter({}, {mapping.substr(0, mapping.find('='))}).takes(id);
+  }
+  // The --map that decides about that stream: the first one that takes it.
+  std::vector<std::string>::const_iterator mapping_of(const StreamId& id) const {
+    return std::ranges::find_if(options_.mappings,
+                                [&](const std::string& mapping) { return takes(mapping, id); });
   }
 
   // Its name here, with a host.
   Result<StreamId> target_of(const StreamId& id) const {
     StreamId target = id;
     if (!options_.on_hosts) target.host = own_host_;
-    for (const std::string& mapping : options_.mappings) {
-      const std::size_t equals = mapping.find('=');
-      if (!StreamFilter({}, {mapping.substr(0, equals)}).takes(id)) continue;
-      target = DSSM_TRY(StreamId::parse(mapping.substr(equals + 1)));
+    if (const auto mapping = mapping_of(id); mapping != options_.mappings.end()) {
+      target = DSSM_TRY(StreamId::parse(mapping->substr(mapping->find('=') + 1)));
       if (target.host.empty()) target.host = own_host_;
-      break;
     }
     return target;
+  }
+
+  // A wrong name in one would have the stream that was meant played as itself.
+  Result<void> check_mappings() const {
+    for (auto mapping = options_.mappings.begin(); mapping != options_.mappings.end(); ++mapping) {
+      if (std::ranges::any_of(targets_, [&](const Target& target) {
+            return mapping_of(target.source) == mapping;
+          })) {
+        continue;
+      }
+      return Error{Errc::not_found,
+                   fmt::format("--map {} applies to no stream that is played; '{}' has {}{}",
+                               escaped(*mapping), escaped(options_.file), streams_text(),
+                               options_.mappings.size() > 1 ? ", and of several --map that fit a "
+                                                              "stream the first one counts"
+                                                            : "")};
+    }
+    return {};
   }
 
   Result<void> check_writers(const StreamId& id) {

@@ -694,6 +694,23 @@ TEST_F(Play, PlaysAPartUnderAnotherName) {
   EXPECT_TRUE(contains(none.err, "'" + file_ + "' has pose:0@pc9\n")) << none.err;
 }
 
+TEST_F(Play, RefusesAMappingThatAppliesToNoStream) {
+  make_recording();
+  for (const std::vector<std::string> mappings :
+       {std::vector<std::string>{"pos=copy"}, {"pose=copy", "po*=second"}}) {
+    std::vector<std::string> words = {"play", file_};
+    for (const std::string& mapping : mappings) words.insert(words.end(), {"--map", mapping});
+    const Finished refused = ctl(words);
+    EXPECT_EQ(refused.exit_status, 1);
+    EXPECT_TRUE(contains(refused.err, "--map " + mappings.back() +
+                                          " applies to no stream that is "
+                                          "played; '" +
+                                          file_ + "' has pose:0@pc9"))
+        << refused.err;
+    EXPECT_EQ(own_streams(), std::vector<std::string>{}) << "it would be played as itself";
+  }
+}
+
 TEST_F(Play, CountsTimesFromBothEnds) {
   make_recording();
   output({"play", file_, "--map", "pose=copy", "--from", "+10ms", "--to", "+0.02"});
