@@ -230,14 +230,18 @@ ReadStatus RawReader::read_tid(Tid tid, std::span<std::byte> payload, SampleInfo
   Tid wanted = state_->cursor + 1;
   return retry([&]() -> std::optional<ReadStatus> {
     ReadStatus status = state_->ring.read(wanted, payload, info);
-    if (status == ReadStatus::arriving) {
+    const bool is_arriving = status == ReadStatus::arriving;
+    if (is_arriving) {
       state_->awaited = wanted;
       state_->want_history();
       status = ReadStatus::not_yet;
     }
     if (status == ReadStatus::not_yet) {
       // Only now: the samples of the old ring are read first.
-      return state_->restart_due() && state_->restart() ? ReadStatus::restarted : status;
+      if (!state_->restart_due()) return status;
+      // The last one may have come after it was read, and before the new ring.
+      if (!is_arriving && state_->ring.newest() >= wanted) return kOvertaken;
+      return state_->restart() ? ReadStatus::restarted : status;
     }
     if (status == ReadStatus::ok) {
       state_->lost += static_cast<std::uint64_t>(wanted - (state_->cursor + 1));

@@ -3,6 +3,8 @@
 // Readers of a stream that begins anew: told once, then on the new ring.
 #include <gtest/gtest.h>
 #include <poll.h>
+#include <pthread.h>
+#include <signal.h>
 
 #include <atomic>
 #include <dssm/dssm.hpp>
@@ -70,6 +72,54 @@ TEST(NewRing, IsGoneOnWithAfterTheOldOneIsReadToItsEnd) {
   }
   EXPECT_EQ(reader.read_next(value, info), ReadStatus::not_yet);
   EXPECT_EQ(reader.lost_samples(), 0u);
+}
+
+// What interrupt() runs in the thread that it interrupts: it stands still until released.
+std::atomic<bool> interrupted, released;
+void stand_still(int) {
+  interrupted = true;
+  while (!released) {
+  }
+}
+
+// The last sample of the old ring comes, and then the new ring, at any moment of a read.
+TEST(NewRing, IsFollowedOnlyAfterASampleThatCameDuringTheRead) {
+  const DaemonProcess daemon;
+  Session session = connect(daemon);
+  Session other = connect(daemon);
+  Writer<double> writer = other.create<double>("anew", History{16, 1ms}).value();
+  Reader<double> reader = session.open_reader<double>("anew").value();
+  reader.seek(kNoTid);
+  struct sigaction before {};
+  struct sigaction action {};
+  action.sa_handler = stand_still;
+  ASSERT_EQ(::sigaction(SIGUSR1, &action, &before), 0);
+  const pthread_t reading = ::pthread_self();
+  for (int round = 0; round < 100; ++round) {
+    interrupted = released = false;
+    std::jthread meanwhile([&] {
+      Reader<double> last = session.open_reader<double>("anew").value();
+      last.seek(kNoTid);
+      ::pthread_kill(reading, SIGUSR1);
+      await([] { return interrupted.load(); });
+      writer.write(round);
+      writer = recreate(other);
+      double value = 0;
+      SampleInfo info;
+      EXPECT_EQ(next(last, value, info), ReadStatus::ok);
+      // dssmd told the earlier reader first.
+      EXPECT_EQ(next(last, value, info), ReadStatus::restarted);
+      released = true;
+    });
+    double value = 0;
+    SampleInfo info;
+    ReadStatus status = ReadStatus::not_yet;
+    while (status == ReadStatus::not_yet) status = reader.read_next(value, info);
+    ASSERT_EQ(status, ReadStatus::ok) << "in round " << round;
+    ASSERT_EQ(value, round);
+    ASSERT_EQ(next(reader, value, info), ReadStatus::restarted);
+  }
+  ::sigaction(SIGUSR1, &before, nullptr);
 }
 
 TEST(NewRing, WakesReadersThatSleepOnTheOldOne) {
