@@ -36,7 +36,7 @@ struct Converted {
 
 // --- to MCAP
 
-// Writes samples and properties; of tids that are missing, a gap.
+// Writes samples, properties and triggers; of tids that are missing, a gap.
 class McapOutput {
  public:
   McapOutput(RecordingWriter file, const Recording& recording)
@@ -66,6 +66,9 @@ class McapOutput {
   Result<void> finish() {
     for (std::size_t stream = 0; stream < numbers_.size(); ++stream) {
       if (takes(stream)) DSSM_TRY(write_properties(stream, Time::max()));
+    }
+    for (const RecordedTrigger& trigger : recording_.triggers()) {
+      DSSM_TRY(file_.add_trigger(trigger));
     }
     return file_.finish();
   }

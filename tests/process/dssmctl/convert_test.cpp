@@ -228,6 +228,24 @@ TEST_F(Convert, KeepsAllPropertiesWithTheirTimes) {
   EXPECT_EQ(recording.property(1, 0).value(), std::vector{std::byte{2}});
 }
 
+TEST_F(Convert, KeepsWhatTriggeredTheRecording) {
+  RecordingWriter writer = RecordingWriter::create(file("a.mcap")).value();
+  RecordedStream stream;
+  stream.id = {"pose", 0, "pc1"};
+  stream.type.payload_bytes = 8;
+  ASSERT_TRUE(writer.add_stream(stream));
+  ASSERT_TRUE(writer.add_trigger({"tilt", "too far", "pc1", at_ns(7)}));
+  ASSERT_TRUE(writer.add_trigger({"stop", "", "pc2", at_ns(9)}));
+  ASSERT_TRUE(writer.finish());
+  output({"convert", file("a.mcap"), file("b.mcap")});
+  const Recording recording = Recording::open(file("b.mcap")).value();
+  ASSERT_EQ(recording.triggers().size(), 2U);
+  EXPECT_EQ(recording.triggers()[0].name, "tilt");
+  EXPECT_EQ(recording.triggers()[0].reason, "too far");
+  EXPECT_EQ(recording.triggers()[1].host, "pc2");
+  EXPECT_EQ(recording.triggers()[1].time, at_ns(9));
+}
+
 TEST_F(Convert, InfoAndPlayTakeLogs) {
   const auto record = [](double time, double x) {
     std::string bytes(16, '\0');
