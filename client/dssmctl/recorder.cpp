@@ -21,6 +21,20 @@ std::optional<Time> time_from_tid(const RawReader& reader, Tid tid) {
   return std::nullopt;
 }
 
+// The first sample after the cursor that is there and not before `from`, or else the next one that
+// is written; kNoTid: that is not known, because the network has yet to bring what is there.
+Tid first_wanted(const RawReader& reader, std::optional<Time> from) {
+  SampleInfo info;
+  const Tid newest = reader.newest_tid();
+  for (Tid tid = reader.cursor() + 1; tid <= newest; ++tid) {
+    tid = std::max(tid, reader.oldest_tid());
+    const ReadStatus status = reader.read_info(tid, info);
+    if (status == ReadStatus::arriving) return kNoTid;
+    if (status == ReadStatus::ok && (!from || info.time >= *from)) return tid;
+  }
+  return newest == kNoTid ? kNoTid : newest + 1;
+}
+
 // Puts the cursor before the sample of that time, unless it is beyond. To read over the samples
 // before it would copy each.
 void skip_to(RawReader& reader, Time time) {
@@ -77,9 +91,10 @@ bool Recorder::Opener::wants(const StreamInfo& stream) const {
 void Recorder::Opener::on_event(const StreamEvent& event) {
   const std::string name = event.stream.id.str();
   const std::lock_guard lock(mutex_);
-  // It has another type than its reader can continue with. That is opened at once, and not when the
-  // reader finds that out: until then the ring may be overwritten, or be removed, too.
+  // It was created again. That is opened at once, and not when its reader has read the ring before
+  // and follows: until then this ring may be overwritten, or be replaced, too.
   std::optional<std::uint64_t> replaced_incarnation;
+  bool is_other_type = false;  // than its reader can continue with
   if (event.kind == StreamEvent::Kind::added && wants(event.stream)) {
     const auto known = known_.find(name);
     if (event.property_set) {
@@ -92,12 +107,11 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
     }
     if (known != known_.end()) {
       auto& [incarnation, type] = known->second;
-      if (incarnation != event.stream.incarnation && !event.stream.type.check_usable_as(type)) {
+      if (incarnation != event.stream.incarnation) {
         replaced_incarnation = incarnation;
-      } else {
-        incarnation = event.stream.incarnation;
-        // The reader continues only with such ones then.
-        if (type.is_less_described_than(event.stream.type)) type = event.stream.type;
+        is_other_type = !event.stream.type.check_usable_as(type);
+      } else if (type.is_less_described_than(event.stream.type)) {
+        type = event.stream.type;  // the reader continues only with such ones then
       }
     }
   }
@@ -136,9 +150,7 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
   // One that fits since it was described was there, too.
   const bool was_there = is_beginning_ || event.described;
   untried_ += was_there;
-  if (replaced_incarnation) {
-    notice_reopening(event.stream.id, "its samples are of another type now");
-  }
+  if (is_other_type) notice_reopening(event.stream.id, "its samples are of another type now");
   wanted_.push_back({event.stream, MonoClock::now(), was_there, false, replaced_incarnation});
   changed_.notify_one();
 }
@@ -266,9 +278,7 @@ void Recorder::Opener::run() {
     });
     const std::uint64_t incarnation = wanted.stream.incarnation;  // 0: not known
     if (entry != wanted_.end() && entry->stream.incarnation != incarnation) {
-      const StreamInfo& next_one = entry->stream;
-      const bool is_opened = opened && (opened->reader.incarnation() == next_one.incarnation ||
-                                        next_one.type.check_usable_as(opened->reader.type()));
+      const bool is_opened = opened && opened->reader.incarnation() == entry->stream.incarnation;
       if (!is_opened) {  // that one has its turn
         if (opened) entry->replaced_incarnation = opened->reader.incarnation();
         entry = wanted_.end();
@@ -319,11 +329,12 @@ Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
     const Result<StreamInfo> now = session.stream_info(wanted.stream.id);
     source.is_of_now = !now || now->state != StreamState::unknown;
   }
+  const StreamInfo& then = wanted.stream;  // as dssmd reported it
+  const std::uint64_t incarnation = source.reader.incarnation();
+  const bool is_known = then.incarnation == incarnation &&
+                        (then.newest != kNoTid || then.state == StreamState::empty);
   if (!with_history) {
     // What was written since the recording began, if dssmd said what was there then.
-    const StreamInfo& then = wanted.stream;
-    const bool is_known = then.incarnation == source.reader.incarnation() &&
-                          (then.newest != kNoTid || then.state == StreamState::empty);
     const Tid before = is_known ? std::min(then.newest, newest) : newest;
     source.reader.seek(before);
     source.next = before + 1;
@@ -336,8 +347,11 @@ Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
       source.until = plan_.range->last;
     }
     if (source.from) skip_to(source.reader, *source.from);
-    const std::uint64_t incarnation = source.reader.incarnation();
-    if (wanted.replaced_incarnation.value_or(incarnation) != incarnation) source.next = 0;
+    // What is there now counts, also if it is overwritten before it is read; of a new ring all.
+    const bool was_empty = is_known && then.newest == kNoTid;
+    const bool is_again = wanted.replaced_incarnation.value_or(incarnation) != incarnation;
+    source.next = was_empty || is_again ? source.reader.cursor() + 1
+                                        : first_wanted(source.reader, source.from);
   }
   return source;
 }
@@ -396,7 +410,7 @@ Result<void> Recorder::begin(RecordingWriter file, Duration before) {
   past_moved_ = MonoClock::now();
   period_ = kMinPeriod;
   for (Source& source : sources_) {
-    want_past(source);
+    want_past(source, false);
     if (Result<void> added = add_to_file(source); !added) {
       is_recording_ = false;
       return added;
@@ -406,13 +420,13 @@ Result<void> Recorder::begin(RecordingWriter file, Duration before) {
 }
 
 // Of what its ring holds, the samples from wanted_from_ on that no file has.
-void Recorder::want_past(Source& source) const {
+void Recorder::want_past(Source& source, bool is_new) const {
   RawReader& reader = source.reader;
   source.from = past_of(source, wanted_from_, before_);
-  source.next = kNoTid;
   skip_to(reader, *source.from);
   const Tid newest = reader.newest_tid();
   source.past_until = newest > reader.cursor() ? newest : kNoTid;
+  source.next = is_new ? reader.cursor() + 1 : first_wanted(reader, source.from);
 }
 
 Result<void> Recorder::end() {
@@ -482,7 +496,7 @@ Result<void> Recorder::add(Source source) {
   if (is_duplicate(source)) return {};
   Source& added = sources_.emplace_back(std::move(source));
   if (!is_recording_) return {};
-  if (is_on_demand_) want_past(added);
+  if (is_on_demand_) want_past(added, added.next == 0);
   return add_to_file(added);
 }
 

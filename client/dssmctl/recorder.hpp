@@ -187,8 +187,8 @@ class Recorder {
       std::optional<std::uint64_t> replaced_incarnation = {};
       bool is_opening = false;
     };
-    // Of a name: the incarnation that was opened last or that its reader continues with, and the
-    // type that the next one needs for that.
+    // Of a name: the incarnation that was opened last, and the type that the next one needs so that
+    // its reader can continue with it.
     struct Known {
       std::uint64_t incarnation = 0;
       TypeInfo type;
@@ -246,7 +246,8 @@ class Recorder {
   Result<void> add_to_file(Source& source);
   // Its description counts from the next file on.
   Result<void> describe(const StreamId& id);
-  void want_past(Source& source) const;
+  //   is_new  all of its ring counts, also what was overwritten
+  void want_past(Source& source, bool is_new) const;
   // take(); samples that are later than `held_from` may wait for earlier ones of other streams.
   Result<void> take_until(Time held_from);
   // A stream in a turn of take().

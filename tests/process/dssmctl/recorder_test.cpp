@@ -12,6 +12,8 @@
 namespace dssm::test {
 namespace {
 
+using namespace std::chrono_literals;
+
 class RecorderOf : public CtlTest {
  protected:
   // Until it has the stream open. Nothing is taken then until the test does.
@@ -21,8 +23,8 @@ class RecorderOf : public CtlTest {
                              {ctl::StreamFilter({}, {}), {}, {}, {}, false})
             .value();
     await_opened(id);
-    ASSERT_TRUE(recorder_->take());
-    ASSERT_EQ(recorder_->streams(), 1U);
+    // dssmd counts the reader before the recorder has the ring.
+    await([&] { return recorder_->take() && recorder_->streams() == 1; });
   }
   void await_opened(const StreamId& id) {
     await([&] { return session_.stream_info(id).value().readers == 1; });
@@ -72,6 +74,50 @@ TEST_F(RecorderOf, AStreamOfAnotherTypeLosesWhatItsRingOverwroteBeforeItWasOpene
   start(writer.id());
   writer = replace<float>(1000, 8);
   await_opened(writer.id());
+  ASSERT_TRUE(recorder_->finish());
+  const RecordingProgress progress = recorder_->progress();
+  EXPECT_GT(progress.samples, 0U);
+  EXPECT_EQ(progress.samples + progress.lost_samples, 1000U);
+}
+
+TEST_F(RecorderOf, AStreamThatIsCreatedAgainTwiceMeanwhileHasAllSamples) {
+  RawWriter writer = replace<double>(0);
+  start(writer.id());
+  writer = replace<double>(5);
+  await_opened(writer.id());
+  writer = replace<double>(6);
+  await_opened(writer.id());
+  ASSERT_TRUE(recorder_->finish());
+  EXPECT_EQ(recorder_->streams(), 1U);
+  EXPECT_EQ(recorder_->take_notices(), std::vector<std::string>());
+  const Recording recording = Recording::open(file_).value();
+  std::vector<std::uint64_t> samples;
+  for (const RecordedStreamInfo& stream : recording.streams()) samples.push_back(stream.samples);
+  EXPECT_EQ(samples, (std::vector<std::uint64_t>{0, 5, 6}));
+}
+
+TEST_F(RecorderOf, AStreamThatComesLaterLosesWhatItsRingOverwroteBeforeItWasOpened) {
+  RawWriter other = session_.create_raw({"other", 0, ""}, type_of<double>(), depth_of(8)).value();
+  start(other.id());
+  const RawWriter writer = replace<float>(1000, 8);
+  await_opened(writer.id());
+  ASSERT_TRUE(recorder_->finish());
+  const RecordingProgress progress = recorder_->progress();
+  EXPECT_GT(progress.samples, 0U);
+  EXPECT_EQ(progress.samples + progress.lost_samples, 1000U);
+}
+
+// As new samples do, those of the past may wait in their ring for others.
+TEST_F(RecorderOf, ThePastLosesWhatItsRingOverwroteAfterItWasOpened) {
+  RawWriter writer = replace<double>(0, 128);
+  const double value = 0;
+  const auto payload = std::as_bytes(std::span(&value, 1));
+  for (int i = 0; i < 8; ++i) writer.write(payload, WallClock::now() + 50ms);
+  recorder_ = ctl::Recorder::start(session_with(daemon_), RecordingWriter::create(file_).value(),
+                                   {ctl::StreamFilter({}, {}), {}, 1h, {}, false})
+                  .value();
+  await([&] { return recorder_->take() && recorder_->streams() == 1; });
+  for (int i = 8; i < 1000; ++i) writer.write(payload);
   ASSERT_TRUE(recorder_->finish());
   const RecordingProgress progress = recorder_->progress();
   EXPECT_GT(progress.samples, 0U);
