@@ -53,8 +53,9 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
 [[gnu::hot]] Result<PumpWait> SamplePump::pump(MonoTime now, bool only_under_way) {
   if (decides_late()) fit_unsent_limit();
   has_filled_ = false;
-  std::size_t bytes = 0;
-  for (int samples = 0; samples < kSamplesPerTurn && bytes < kBytesPerTurn;) {
+  const std::uint64_t begin = sender_.payload_bytes();
+  for (int samples = 0;
+       samples < kSamplesPerTurn && sender_.payload_bytes() - begin < kBytesPerTurn;) {
     SendStatus status = SendStatus::sent;
     Tid sent_up_to = chosen() + 1;
     SampleSender::SliceLimits limits = kAtOnce;
@@ -63,7 +64,6 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       if (!only_under_way) limits = limits_now(now);
       if (limits.most_bytes == 0) return wait_for_pace();
       status = sender_.go_on(limits);
-      bytes += SampleSender::kSliceBytes;
     } else if (only_under_way) {
       sender_.end_run();
       return connection_.output_empty() ? PumpWait::turn : PumpWait::output;
@@ -91,7 +91,6 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       if (sender_.sends_in_place()) {
         sent_up_to = at + 1;
         status = sender_.send(at, 0, at < last, limits);
-        bytes += std::min(payload_bytes_, SampleSender::kSliceBytes);
       } else {
         // The writer continues meanwhile: the newest sample may not be the newest any more.
         const std::size_t fit = limits.most_bytes / (payload_bytes_ + kHeaderBytes);
@@ -100,7 +99,6 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
                                             thins() && !fills_ ? 1 : kSamplesPerTurn - samples) -
                             1;
         status = sender_.send_many(at, std::min(last, at_most), sent_up_to);
-        bytes += static_cast<std::size_t>(sent_up_to - at) * payload_bytes_;
       }
     }
     if (fills_) {

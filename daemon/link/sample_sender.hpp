@@ -101,6 +101,10 @@ class SampleSender {
   void end_run();
 
   const Counters& counters() const noexcept { return counters_; }
+  // As many as were copied or sent in place.
+  std::uint64_t payload_bytes() const noexcept {
+    return counters_.copied_payload_bytes + counters_.in_place_payload_bytes;
+  }
 
  private:
   SendStatus send_copy(Tid tid, std::uint64_t serial);

@@ -412,6 +412,16 @@ TEST(SamplePump, FailsWhenItMayNeitherTearNorCopy) {
   EXPECT_NE(wait.error().message.find("max_peer_memory"), std::string::npos);
 }
 
+TEST(SamplePump, CountsTheLengthThatShortSamplesOfALongTypeHave) {
+  PumpRig rig(SamplePump::kBytesPerTurn, 64);
+  for (int i = 0; i < 50; ++i) {
+    rig.ring.writer().write(ring::payload_for(i, 100), time_of(i), Duration(5));
+  }
+  rig.start({0, 49, 0});
+  EXPECT_EQ(rig.run(), PumpWait::sample) << "all in one turn";
+  EXPECT_EQ(rig.sender.counters().samples, 50u);
+}
+
 TEST(SamplePump, CutsALongSampleIntoTurns) {
   constexpr std::size_t kLong = 5 * SamplePump::kBytesPerTurn + 17;
   for (const bool may_tear : {true, false}) {
