@@ -74,10 +74,10 @@ template <class Attempt>
   return ReadStatus::lapped;
 }
 
-// What a read returns to the program.
-[[gnu::always_inline]] inline ReadStatus result(detail::ReaderState& state,
-                                                ReadStatus status) noexcept {
-  if (status == ReadStatus::arriving) state.want_history();
+// What a read of sample `tid` returns to the program; 0: by time.
+[[gnu::always_inline]] inline ReadStatus result(detail::ReaderState& state, ReadStatus status,
+                                                Tid tid = 0) noexcept {
+  if (status == ReadStatus::arriving) state.want_history(tid);
   return status;
 }
 
@@ -180,12 +180,15 @@ bool ReaderState::restart() noexcept {
   return !same_samples;
 }
 
-[[gnu::cold]] void ReaderState::want_history() noexcept {
+[[gnu::cold]] void ReaderState::want_history(Tid from) noexcept {
   const MonoTime now = MonoClock::now();
-  if (to_ns(now.time_since_epoch()) < next_wish_ns) return;
+  const bool is_soon = to_ns(now.time_since_epoch()) < next_wish_ns;
+  if (is_soon && from >= last_wish) return;
+  if (is_soon) from = 0;
   next_wish_ns = to_ns((now + kHistoryPause).time_since_epoch());
+  last_wish = from;
   const std::shared_ptr<OpenStream> on = stream_now();
-  on->client->want_history(*on);
+  on->client->want_history(*on, from);
 }
 
 std::shared_ptr<OpenStream> ReaderState::stream_now() const {
@@ -220,7 +223,7 @@ ReadStatus RawReader::read_tid(Tid tid, std::span<std::byte> payload, SampleInfo
   DSSM_CHECK(payload.size() == payload_bytes());
   const ReadStatus status = state_->ring.read(tid, payload, info);
   if (status == ReadStatus::ok) state_->set_cursor(tid);
-  return result(*state_, status);
+  return result(*state_, status, tid);
 }
 
 [[gnu::hot]] ReadStatus RawReader::read_next(std::span<std::byte> payload,
@@ -233,7 +236,7 @@ ReadStatus RawReader::read_tid(Tid tid, std::span<std::byte> payload, SampleInfo
     const bool is_arriving = status == ReadStatus::arriving;
     if (is_arriving) {
       state_->awaited = wanted;
-      state_->want_history();
+      state_->want_history(wanted);
       status = ReadStatus::not_yet;
     }
     if (status == ReadStatus::not_yet) {
@@ -392,7 +395,7 @@ Tid RawReader::newest_tid() const noexcept { return state_->ring.newest(); }
 Tid RawReader::oldest_tid() const noexcept { return state_->ring.oldest(); }
 
 ReadStatus RawReader::read_info(Tid tid, SampleInfo& info) const noexcept {
-  return result(*state_, state_->ring.stamp(tid, info));
+  return result(*state_, state_->ring.stamp(tid, info), tid);
 }
 
 ReadStatus RawReader::find(Time t, SampleInfo& info) const noexcept {
@@ -420,7 +423,7 @@ ReadStatus RawReader::borrow(Tid tid, BorrowedSample& out) noexcept {
   if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
   ring::RingReader::Place place{};
   const ReadStatus status = state_->ring.locate(tid, place, out.info_);
-  if (status != ReadStatus::ok) return result(*state_, status);
+  if (status != ReadStatus::ok) return result(*state_, status, tid);
   out.payload_ = {place.payload, out.info_.payload_bytes};
   out.sequence_ = place.sequence;
   state_->set_cursor(tid);
@@ -446,7 +449,7 @@ WaitStatus RawReader::wait_for_sample(Tid tid, MonoTime deadline) noexcept {
   const ring::RingReader ring(*stream->ring->mapping);
   return wait_until(*stream->ring, deadline, [&] {
     if (ring.is_settled(tid)) return true;
-    if (tid <= ring.newest()) state_->want_history();
+    if (tid <= ring.newest()) state_->want_history(tid);
     return state_->restart_wakes(*stream);
   });
 }
