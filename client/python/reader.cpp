@@ -257,7 +257,7 @@ void define_readers(py::module_& module) {
            py::arg("wait") = false,
            "The samples with t0 <= time < t1 that the ring still has, as one numpy.recarray with "
            "the "
-           "fields tid, time_ns, clock_error_ns and value. Keeps the cursor.\n\n"
+           "fields tid, time_ns, clock_error_ns, payload_bytes and value. Keeps the cursor.\n\n"
            "If times run backwards: from the first sample from which on all are at least t0, up to "
            "the "
            "first one that is at least t1.\n\n"

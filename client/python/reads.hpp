@@ -257,7 +257,8 @@ class Rows {
   }
   void add(const SampleInfo& info) noexcept {
     zero_rest(payload(), info);
-    const std::int64_t header[] = {info.tid, to_ns(info.time), to_ns(info.clock_error)};
+    const std::int64_t header[] = {info.tid, to_ns(info.time), to_ns(info.clock_error),
+                                   static_cast<std::int64_t>(info.payload_bytes)};
     static_assert(sizeof header == ValueType::kRowHeaderBytes);
     std::memcpy(data_ + size_++ * row_bytes_, header, sizeof header);
   }

@@ -48,10 +48,10 @@ class ValueType {
   // The same as an array of bytes.
   static py::object bytes_view(std::span<const std::byte> payload, const py::object& owner);
 
-  // An array of `count` rows: tid, time_ns, clock_error_ns and value. The distance between rows,
-  // and where a row has its value.
+  // An array of `count` rows: tid, time_ns, clock_error_ns, payload_bytes and value. The
+  // distance between rows, and where a row has its value.
   py::object new_rows(std::size_t count) const;
-  static constexpr std::size_t kRowHeaderBytes = 24;
+  static constexpr std::size_t kRowHeaderBytes = 32;
   std::size_t row_bytes() const noexcept { return kRowHeaderBytes + payload_bytes_; }
   static std::byte* data_of(const py::object& array);
 

@@ -45,10 +45,10 @@ def dtype_of(info: TypeInfo) -> np.dtype:
 def row_dtype(value: np.dtype) -> np.dtype:
     """The dtype of the rows of a history."""
     return _as_record(np.dtype({
-        "names": ["tid", "time_ns", "clock_error_ns", "value"],
-        "formats": ["<i8", "<i8", "<i8", value],
-        "offsets": [0, 8, 16, 24],
-        "itemsize": 24 + value.itemsize,
+        "names": ["tid", "time_ns", "clock_error_ns", "payload_bytes", "value"],
+        "formats": ["<i8", "<i8", "<i8", "<i8", value],
+        "offsets": [0, 8, 16, 24, 32],
+        "itemsize": 32 + value.itemsize,
     }))
 
 

@@ -105,6 +105,7 @@ class Recordings(Case):
         self.assertEqual([(s.tid, s.time_ns, int(s.value.n)) for s in samples],
                          [(0, T0, 0), (1, T0 + 1, 1), (2, T0 + 2, 2), (5, T0 + 9, 9)])
         self.assertEqual(samples[0].clock_error_ns, 7)
+        self.assertEqual(list(recording.reader("live").history(T0, T0 + 10).payload_bytes), [samples[0].payload_bytes] * 4)
 
     def test_restarts_are_followed(self):
         with dssm.RecordingWriter(self.file) as recording:

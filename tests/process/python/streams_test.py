@@ -254,6 +254,9 @@ class Types(Case):
         self.assertEqual((sample.value.tobytes(), sample.payload_bytes), (b"abc", 3))
         writer.write(np.arange(100, dtype="u1"), T0)
         np.testing.assert_array_equal(reader.newest().value, np.arange(100))
+        history = reader.history(T0, T0 + 1)
+        self.assertEqual(list(history.payload_bytes), [3, 100])
+        self.assertEqual(history.value[0].tobytes(), b"abc" + bytes(97))
         with self.assertRaisesRegex(ValueError, "at most 100 bytes"):
             writer.write(bytes(101))
 
