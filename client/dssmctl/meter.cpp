@@ -19,8 +19,13 @@ constexpr Duration kArrivingPeriod = std::chrono::milliseconds(10);
 // Reads the stamps of all samples after the reader's cursor, up to the newest one of this moment.
 class StampReader {
  public:
-  StampReader(RawReader& reader, Meter& meter, MeterState& state)
-      : reader_(reader), meter_(meter), state_(state), pauses_(reader.cycle()) {}
+  //   in_order  waits for samples that come after newer ones
+  StampReader(RawReader& reader, Meter& meter, MeterState& state, bool in_order)
+      : reader_(reader),
+        meter_(meter),
+        state_(state),
+        in_order_(in_order),
+        pauses_(reader.cycle()) {}
 
   void read_new() {
     read_ring();
@@ -35,10 +40,11 @@ class StampReader {
   // Before a report.
   void update_state() {
     state_.empty = reader_.newest_tid() == kNoTid;
+    state_.arriving = reader_.newest_tid() > reader_.cursor();
     state_.age = saturating_sub(WallClock::now(), newest_time_);
     const Duration quiet = MonoClock::now() - newest_arrival_;
-    state_.stalled = state_.seen > 0 && quiet >= pauses_.length() ? std::optional(quiet)
-                                                                  : std::optional<Duration>();
+    const bool is_stalled = state_.seen > 0 && !state_.arriving && quiet >= pauses_.length();
+    state_.stalled = is_stalled ? std::optional(quiet) : std::nullopt;
   }
 
   // The newest of the samples that were read came `age` ago.
@@ -57,7 +63,13 @@ class StampReader {
     while (tid <= newest) {
       SampleInfo info;
       const ReadStatus status = reader_.read_info(tid, info);
-      if (status == ReadStatus::arriving) break;  // counted when it is here
+      if (status == ReadStatus::arriving && in_order_) break;  // counted when it is here
+      if (status == ReadStatus::arriving) {
+        ++state_.late;
+        ++tid;
+        on_gap();
+        continue;
+      }
       if (status != ReadStatus::ok) {
         const Tid next = std::max(reader_.oldest_tid(), tid + 1);
         state_.lost += static_cast<std::uint64_t>(next - tid);
@@ -96,6 +108,7 @@ class StampReader {
   RawReader& reader_;
   Meter& meter_;
   MeterState& state_;
+  bool in_order_;
   PauseDetector pauses_;
   Time newest_time_{};
   MonoTime newest_arrival_{};
@@ -115,7 +128,9 @@ Tid start_before(const RawReader& reader, bool from_history, std::uint64_t windo
 // A stream that is being measured. It stays where it is: its parts refer to each other.
 struct Measured {
   Measured(OpenedStream stream, const MeterKind& kind)
-      : opened(std::move(stream)), meter(kind.make(opened.reader)) {
+      : opened(std::move(stream)),
+        meter(kind.make(opened.reader)),
+        stamps(opened.reader, *meter, state, kind.from_history) {
     state.stream = opened.reader.id();
     state.payload_bytes = opened.reader.payload_bytes();
   }
@@ -139,7 +154,7 @@ struct Measured {
   OpenedStream opened;
   std::unique_ptr<Meter> meter;
   MeterState state;
-  StampReader stamps{opened.reader, *meter, state};
+  StampReader stamps;
   std::optional<Follower> follower;
   bool ended = false;
 };
@@ -153,15 +168,18 @@ std::string note(const MeterState& state) {
   if (state.stalled) {
     add("no new samples for " + duration_text(*state.stalled));
   } else if (state.new_samples == 0) {
-    add(state.empty ? "no samples yet" : "no new samples");
+    add(state.empty      ? "no samples yet"
+        : state.arriving ? "the next samples are on their way, newer ones are here"
+                         : "no new samples");
   }
   return text;
 }
 
-// "--- odom:0@pc1: 12 samples, 0 lost ---", before a final report.
+// "--- odom:0@pc1: 12 samples, 0 lost, 3 late ---", before a final report.
 std::string final_line(const MeterState& state) {
-  return fmt::format("--- {}: {} samples, {} lost{} ---\n", escaped(state.stream.str()), state.seen,
-                     state.lost,
+  return fmt::format("--- {}: {} samples, {} lost{}{} ---\n", escaped(state.stream.str()),
+                     state.seen, state.lost,
+                     state.late > 0 ? fmt::format(", {} late", state.late) : "",
                      state.restarts > 0 ? fmt::format(", restarts: {}", state.restarts) : "");
 }
 
@@ -266,6 +284,7 @@ class Meters {
     json["new_samples"] = state.new_samples;
     json["seen_samples"] = state.seen;
     json["lost_samples"] = state.lost;
+    json["late_samples"] = state.late;
     json["restarts"] = state.restarts;
     json["age_ns"] = state.seen > 0 ? Json(to_ns(state.age)) : Json();
     json["paused_ns"] = state.paused ? Json(to_ns(*state.paused)) : Json();

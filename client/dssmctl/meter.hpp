@@ -27,11 +27,13 @@ struct MeterState {
   std::uint64_t seen = 0;           // samples since the start
   std::uint64_t new_samples = 0;    // since the last report
   std::uint64_t lost = 0;           // overwritten before their stamps were read, since the start
-  std::uint64_t restarts = 0;       // of the stream, since the start
-  Duration age{};                   // of the newest sample seen; meaningless while seen is 0
+  std::uint64_t late = 0;      // newer ones came before them, and they are not measured, likewise
+  std::uint64_t restarts = 0;  // of the stream, since the start
+  Duration age{};              // of the newest sample seen; meaningless while seen is 0
   std::optional<Duration> paused;   // length of the newest pause that ended since the last report
   std::optional<Duration> stalled;  // no sample came for so long, which is longer than usual
   bool empty = false;               // the stream has no samples
+  bool arriving = false;            // newer ones are here than those that were read
   bool final = false;               // the last one, not after an interval
 };
 
@@ -72,7 +74,8 @@ class Meter {
 
 struct MeterKind {
   // Whether to begin with the samples that the ring holds already; then the first report comes as
-  // soon as there are two samples of a stream, not after an interval.
+  // soon as there are two samples of a stream, not after an interval. And whether to wait for those
+  // that come after newer ones; else they are not measured, so that what came waits for nothing.
   bool from_history = false;
   std::vector<Table::Column> columns;  // of Meter::cells()
   // `reader` outlives the meter.
