@@ -33,6 +33,9 @@ constexpr std::size_t kMaxSubscriptions = 4096;
 constexpr int kMaxTurnSamples = 200;
 constexpr Duration kTimePeriod = std::chrono::milliseconds(50);
 constexpr Duration kLossReportPeriod = std::chrono::seconds(2);
+// A client gets samples in their order. For one that is still to come although newer ones are here,
+// it waits so long: after that the present is worth more.
+constexpr Duration kMaxArriving = std::chrono::seconds(1);
 
 // The first byte of a binary message.
 constexpr unsigned char kMessageData = 1;
@@ -181,7 +184,7 @@ class FoxgloveConnection : public Connection {
     if (playback_) {
       play(now);
     } else {
-      for (auto& [id, subscription] : subscriptions_) send_samples(id, subscription);
+      for (auto& [id, subscription] : subscriptions_) send_samples(id, subscription, now);
     }
     if (now >= next_time_ && peer_.waiting_bytes() < kMaxWaitingBytes) {
       next_time_ = now + kTimePeriod;
@@ -200,8 +203,7 @@ class FoxgloveConnection : public Connection {
       report(1,
              fmt::format("{} samples were left out: {}", std::exchange(left_out_, 0),
                          playback_ ? "they were overwritten, came too late, or are of another type"
-                                   : "this client or the network to it is slower than the "
-                                     "streams"));
+                                   : "this client or a network is slower than the streams"));
     }
   }
 
@@ -210,6 +212,7 @@ class FoxgloveConnection : public Connection {
     std::uint32_t channel = 0;
     Tid next = kNoTid;  // kNoTid: from the newest on
     std::uint64_t incarnation = 0;
+    std::optional<MonoTime> arriving_since;  // sample `next`
     bool wants_present = true;  // of a playback: it has not got a sample of the position yet
   };
 
@@ -484,7 +487,7 @@ class FoxgloveConnection : public Connection {
         report(1, fmt::format("there is a subscription {}, or one to channel {}, already", *id,
                               *channel));
       } else {
-        subscriptions_.emplace(*id, Subscription{*channel, kNoTid, 0, true});
+        subscriptions_.emplace(*id, Subscription{.channel = *channel});
       }
     }
   }
@@ -497,7 +500,7 @@ class FoxgloveConnection : public Connection {
     }
   }
 
-  void send_samples(std::uint32_t id, Subscription& subscription) {
+  void send_samples(std::uint32_t id, Subscription& subscription, MonoTime now) {
     const auto channel = clients_.channels_.find(subscription.channel);
     if (channel == clients_.channels_.end()) return;
     OpenStream* const stream = clients_.streams_.find(channel->second.stream).stream;
@@ -520,7 +523,14 @@ class FoxgloveConnection : public Connection {
       BorrowedSample sample;
       const ReadStatus status = reader.borrow(subscription.next, sample);
       if (status == ReadStatus::restarted) return stream->follow_restart();
-      if (status == ReadStatus::arriving || status == ReadStatus::not_yet) return;
+      if (status == ReadStatus::not_yet) return;
+      if (status == ReadStatus::arriving) {
+        if (!subscription.arriving_since) subscription.arriving_since = now;
+        if (now - *subscription.arriving_since < kMaxArriving) return;
+        leave_out_before(subscription, newest);
+        continue;
+      }
+      subscription.arriving_since.reset();
       ++subscription.next;
       if (status != ReadStatus::ok) {
         ++left_out_;

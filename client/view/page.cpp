@@ -29,7 +29,9 @@ constexpr std::size_t kMaxAskedFields = 64;
 constexpr std::uint64_t kMaxPoints = 20'000;
 constexpr std::uint64_t kMaxAllPoints = 400'000;      // of all fields of one request
 constexpr std::uint64_t kMaxAnswerBytes = 32U << 20;  // of one answer
-constexpr std::size_t kAlignment = 8;                 // of data in an answer
+// For samples that are read for one answer, each as long as its stream's longest.
+constexpr std::uint64_t kMaxReadBytes = 4 * kMaxAnswerBytes;
+constexpr std::size_t kAlignment = 8;  // of data in an answer
 
 Error bad_request(std::string text) { return {Errc::invalid_argument, std::move(text)}; }
 
@@ -270,17 +272,17 @@ Result<Message> at_answer(Streams& streams, std::uint32_t id, const Json& reques
   const auto payloads = request.find("payloads");
   const bool has_payloads = payloads == request.end() || *payloads != false;
   std::vector<Part> parts;
-  std::uint64_t bytes = 0;
+  std::uint64_t longest_bytes = 0;
   for (const std::string& name : names) {
     const Streams::Found found = streams.find(name);
     parts.push_back({name, found.stream, found.error, {}, ReadStatus::not_yet, {}});
-    if (found.stream) bytes += found.stream->type().payload_bytes;
+    if (found.stream) longest_bytes += found.stream->type().payload_bytes;
   }
-  if (bytes > kMaxAnswerBytes) {
+  if (longest_bytes > kMaxReadBytes) {
     return bad_request(
         fmt::format("samples of these streams may have {} bytes together; at most {} are "
-                    "sent at once",
-                    bytes, kMaxAnswerBytes));
+                    "read at once",
+                    longest_bytes, kMaxReadBytes));
   }
   std::vector<Part*> open;
   for (Part& part : parts) {
@@ -289,6 +291,15 @@ Result<Message> at_answer(Streams& streams, std::uint32_t id, const Json& reques
     if (!t) read_newest(part);
   }
   if (t) read_together(open, *t);
+  std::uint64_t bytes = 0;
+  for (const Part* part : open) {
+    bytes += part->status == ReadStatus::ok ? part->info.payload_bytes : 0;
+  }
+  if (has_payloads && bytes > kMaxAnswerBytes) {
+    return bad_request(
+        fmt::format("samples of these streams have {} bytes together; at most {} are sent at once",
+                    bytes, kMaxAnswerBytes));
+  }
 
   DataAnswer answer(id);
   Json head = {{"t_ns", t ? time_json(*t) : Json()}, {"samples", Json::array()}};

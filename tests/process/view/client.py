@@ -11,6 +11,8 @@
 #                        then code and reason.
 #   client.py hold URL   Subscribes to the first channel of Foxglove's protocol and prints "ready";
 #                        then how many samples come before the first status message, and that.
+#   client.py follow URL Subscribes to the first channel of Foxglove's protocol. Prints the last byte of
+#                        each sample as it comes, and each status message.
 #   client.py play URL   Subscribes to all channels of a recording. Sends each line of standard input,
 #                        "play|pause SPEED SEEK_NS", as a command of Foxglove's playback control, and
 #                        prints its answer: "state STATUS TIME [seek COMMAND]". After "pause" waits
@@ -90,17 +92,34 @@ async def send(url):
             print(closed.code, closed.reason)
 
 
+async def subscribe_to_first(server):
+    channel = None
+    while channel is None:
+        message = json.loads(await server.recv())
+        if message["op"] == "advertise":
+            channel = message["channels"][0]["id"]
+    subscription = {"id": 0, "channelId": channel}
+    await server.send(json.dumps({"op": "subscribe", "subscriptions": [subscription]}))
+
+
+async def follow(url):
+    async with websockets.connect(url, subprotocols=[FOXGLOVE]) as server:
+        await subscribe_to_first(server)
+        while True:
+            message = await server.recv()
+            if isinstance(message, str):
+                message = json.loads(message)
+                if message["op"] == "status":
+                    print(message["message"], flush=True)
+            elif message[0] == MESSAGE_DATA:
+                print(message[-1], flush=True)
+
+
 async def hold(url):
     async with websockets.connect(
         url, subprotocols=[FOXGLOVE], max_size=None, max_queue=1, ping_interval=None
     ) as server:
-        channel = None
-        while channel is None:
-            message = json.loads(await server.recv())
-            if message["op"] == "advertise":
-                channel = message["channels"][0]["id"]
-        subscription = {"id": 0, "channelId": channel}
-        await server.send(json.dumps({"op": "subscribe", "subscriptions": [subscription]}))
+        await subscribe_to_first(server)
         print("ready", flush=True)
         samples = 0
         while True:
@@ -188,4 +207,5 @@ async def loop(url):
 
 
 if __name__ == "__main__":
-    asyncio.run({"ask": ask, "send": send, "hold": hold, "play": play, "loop": loop}[sys.argv[1]](sys.argv[2]))
+    asyncio.run({"ask": ask, "send": send, "hold": hold, "follow": follow, "play": play,
+                 "loop": loop}[sys.argv[1]](sys.argv[2]))

@@ -12,6 +12,7 @@
 #include "tests/process/view/view_fixture.hpp"
 #include "tests/support/folder.hpp"
 #include "tests/support/samples.hpp"
+#include "tests/support/stream_owner.hpp"
 
 namespace dssm::test {
 namespace {
@@ -324,6 +325,22 @@ TEST_F(View, ShowsAllStreamsAtOneTime) {
   EXPECT_EQ(now["samples"][1]["payload"], "0700000000000000");
 }
 
+TEST_F(View, SendsWhatIsShortThoughItsStreamsMayHaveMore) {
+  constexpr std::uint64_t kLongest = 17U << 20;
+  std::vector<RawWriter> writers;
+  for (const char* name : {"front", "rear"}) {
+    writers.push_back(
+        session_.create_raw({name, 0, ""}, {"", kLongest, 1, {}}, depth_of(kMinDepth)).value());
+  }
+  for (RawWriter& writer : writers) writer.write(std::vector<std::byte>(3, std::byte{7}));
+  const Json request = {{"op", "at"}, {"streams", {"front:0@pc1", "rear:0@pc1"}}};
+  const Json samples = ask(request).value("samples", Json::array());
+  ASSERT_EQ(samples.size(), 2U);
+  for (const Json& sample : samples) EXPECT_EQ(sample["payload"], "070707") << sample;
+  for (RawWriter& writer : writers) writer.write(std::vector<std::byte>(kLongest));
+  EXPECT_TRUE(contains(ask(request)["error"].dump(), "sent at once"));
+}
+
 TEST_F(View, LosesNoPeakOfASignal) {
   constexpr int kSamples = 20'000, kPeak = 12'345;
   auto motion = session_.create<Motion>("motion", depth_of(kSamples + 1)).value();
@@ -503,6 +520,25 @@ TEST_F(View, PlaysWhatTheRingsHoldToFoxglove) {
   EXPECT_TRUE(contains(all, "state ended " + std::to_string(ns(199)) + "\n")) << all;
   EXPECT_TRUE(contains(all, "played motion@pc1 100 in order\n")) << all;
   EXPECT_TRUE(contains(all, "played lidar@pc2 10 in order\n")) << all;
+}
+
+struct ViewOfASlowNetwork : WithStreamOwner, CtlTest {
+  ViewOfASlowNetwork() : CtlTest({"--peer", owner.address()}) {}
+};
+
+TEST_F(ViewOfASlowNetwork, ShowsThePresentToFoxgloveThoughEarlierSamplesAreStillToCome) {
+  Running view(view_argv({"--listen", "127.0.0.1:0"}), environment());
+  const std::string line = view.line();
+  const std::size_t at = line.find("http://");
+  ASSERT_NE(at, std::string::npos) << line;
+  Running client({"/usr/bin/python3", source("tests/process/view/client.py"), "follow",
+                  "ws" + line.substr(at + 4)},
+                 {});
+  owner.send_sample(0);
+  EXPECT_EQ(client.line(), "0");
+  owner.send_sample(5);  // 1 to 4 never come
+  EXPECT_EQ(client.line(), "5");
+  EXPECT_TRUE(client.line().starts_with("4 samples were left out: "));
 }
 
 TEST_F(View, PlaysOnWhenAStreamIsCreatedAgainWithAnotherType) {
