@@ -53,6 +53,13 @@ std::vector<Certificate> Sorted::authorities() const {
   return all;
 }
 
+std::vector<Certificate> authorities_in(const Bundle& ca, const Bundle& own) {
+  Bundle both = ca;
+  both.certificates.insert(both.certificates.end(), own.certificates.begin(),
+                           own.certificates.end());
+  return sort_certificates(both).authorities();
+}
+
 namespace {
 
 Result<Identity> wanted_identity(const PkiRequestOptions& options) {
@@ -108,21 +115,20 @@ Result<std::vector<RevocationList>> lists_to_install(const PkiInstallOptions& op
   std::vector<RevocationList> all = DSSM_TRY(read_bundle_if_there(path)).lists;
   all.insert(all.end(), bundle.lists.begin(), bundle.lists.end());
   std::vector<RevocationList> newest = newest_lists(authorities, all);
+  // By their keys: while one CA replaces another, both may have the same name.
   for (const Certificate& ca : authorities) {
-    const std::string name = identity_of(ca).name;
-    if (newest.empty() || std::any_of(newest.begin(), newest.end(),
-                                      [&](const auto& list) { return issuer_of(list) == name; })) {
-      continue;
+    const auto own = std::find_if(newest.begin(), newest.end(), [&](const RevocationList& list) {
+      return is_signed_by(list, ca);
+    });
+    if (own == newest.end() && !newest.empty()) {
+      return wrong_bundle(options,
+                          fmt::format("there is no revocation list of '{}', and dssmd needs one of "
+                                      "each CA; append 'revoked.crl' of that CA to what is "
+                                      "installed",
+                                      escaped(identity_of(ca).name)));
     }
-    return wrong_bundle(options, fmt::format("there is no revocation list of '{}', and dssmd needs "
-                                             "one of each CA; append 'revoked.crl' of that CA to "
-                                             "what is installed",
-                                             escaped(name)));
-  }
-  for (const RevocationList& list : bundle.lists) {
-    if (std::any_of(newest.begin(), newest.end(), [&](const RevocationList& other) {
-          return issuer_of(other) == issuer_of(list) && is_newer(other, list);
-        })) {
+    for (const RevocationList& list : bundle.lists) {
+      if (!is_signed_by(list, ca) || !is_newer(*own, list)) continue;
       note(options, fmt::format("'{}' is newer than the revocation list with number {}; it is kept",
                                 path, number_of(list)));
     }
@@ -137,11 +143,11 @@ Result<void> write_lists(const PkiInstallOptions& options,
 }
 
 Result<void> install_list(const PkiInstallOptions& options, const Bundle& bundle) {
-  const Bundle there =
+  const Bundle ca =
       DSSM_TRY(read_bundle(path_in(options.credentials, kCaCertificate)),
                "install a revocation list: it needs the CA that is installed with a certificate");
-  const auto lists =
-      DSSM_TRY(lists_to_install(options, bundle, sort_certificates(there).authorities()));
+  const Bundle own = DSSM_TRY(read_bundle_if_there(path_in(options.credentials, kOwnCertificate)));
+  const auto lists = DSSM_TRY(lists_to_install(options, bundle, authorities_in(ca, own)));
   return write_lists(options, lists);
 }
 

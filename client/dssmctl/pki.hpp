@@ -37,4 +37,8 @@ struct Sorted {
 };
 Sorted sort_certificates(const Bundle& bundle);
 
+// The CAs in a folder of credentials; intermediate ones are beside the own certificate.
+//   ca, own  the files ca.crt and own.crt
+std::vector<Certificate> authorities_in(const Bundle& ca, const Bundle& own);
+
 }  // namespace dssm::ctl::pki

@@ -120,11 +120,12 @@ Result<Shown> credentials_in(const PkiShowOptions& options) {
   const std::string list_path = path_in(folder, kRevoked);
   const Bundle own =
       DSSM_TRY(read_bundle(own_path), "find certificates ('dssmctl pki install' puts them there)");
-  const Sorted ca = sort_certificates(DSSM_TRY(read_bundle_if_there(ca_path)));
+  const Bundle of_ca = DSSM_TRY(read_bundle_if_there(ca_path));
+  const Sorted ca = sort_certificates(of_ca);
   const Bundle lists = DSSM_TRY(read_bundle_if_there(list_path));
   Shown shown;
   Surroundings around{.intermediates = sort_certificates(own).intermediates, .roots = ca.roots};
-  add_lists(shown, list_path, lists.lists, ca.authorities(), around);
+  add_lists(shown, list_path, lists.lists, authorities_in(of_ca, own), around);
   add_rows(shown, own_path, own.certificates, around);
   const std::size_t own_count = std::min<std::size_t>(shown.rows.size(), 1);  // the first is own
   DSSM_TRY(check_key(shown.rows, own_count, path_in(folder, kOwnKey), options));

@@ -235,10 +235,13 @@ Result<void> load_revoked(X509_STORE* store, const std::vector<Certificate>& aut
   if (lists.empty()) return openssl_error("'" + path + "' holds no revocation list in PEM form");
   if (!is_whole) return openssl_error("a revocation list in '" + path + "' is damaged");
   for (const Certificate& authority : authorities) {
+    // By its key, too: while one authority replaces another, both may have the same name.
     const auto count = std::count_if(lists.begin(), lists.end(), [&](const openssl::List& list) {
       return X509_NAME_cmp(X509_CRL_get_issuer(list.get()),
-                           X509_get_subject_name(authority.get())) == 0;
+                           X509_get_subject_name(authority.get())) == 0 &&
+             X509_CRL_verify(list.get(), X509_get0_pubkey(authority.get())) == 1;
     });
+    ERR_clear_error();
     if (count == 1) continue;
     return Error{Errc::invalid_argument,
                  fmt::format("'{}' holds {} revocation lists of '{}'; of each authority in ca.crt "

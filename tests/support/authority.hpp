@@ -17,7 +17,7 @@
 #include <string_view>
 
 #include "core/base/text.hpp"
-#include "core/wire/network_protocol.hpp"
+#include "core/wire/host_id.hpp"
 
 namespace dssm::test {
 
@@ -46,6 +46,7 @@ class Authority {
     certificate_ = make(name, key_.get(), Hours(-1000), Hours(1000));
     add(certificate_.get(), NID_basic_constraints, "critical,CA:TRUE");
     add(certificate_.get(), NID_key_usage, "critical,keyCertSign,cRLSign");
+    add(certificate_.get(), NID_subject_key_identifier, "hash");
     const Authority& by = above ? *above : *this;
     X509_set_issuer_name(certificate_.get(), X509_get_subject_name(by.certificate_.get()));
     X509_sign(certificate_.get(), by.key_.get(), EVP_sha256());
@@ -60,6 +61,7 @@ class Authority {
     add(made.get(), NID_basic_constraints, "critical,CA:FALSE");
     add(made.get(), NID_ext_key_usage, subject.extended_usage);
     add(made.get(), NID_subject_alt_name, subject.alternative_names);
+    add(made.get(), NID_authority_key_identifier, "keyid:always");
     X509_set_issuer_name(made.get(), X509_get_subject_name(certificate_.get()));
     X509_sign(made.get(), key_.get(), EVP_sha256());
     write(folder / "own.crt", [&](FILE* file) {
@@ -92,6 +94,12 @@ class Authority {
     X509_CRL_add0_revoked(list.get(), revoked);
     ASN1_INTEGER_free(number);
     ASN1_TIME_free(time);
+    X509V3_CTX context{};
+    X509V3_set_ctx(&context, certificate_.get(), nullptr, nullptr, list.get(), 0);
+    X509_EXTENSION* id =
+        X509V3_EXT_conf_nid(nullptr, &context, NID_authority_key_identifier, "keyid:always");
+    X509_CRL_add_ext(list.get(), id, -1);
+    X509_EXTENSION_free(id);
     X509_CRL_sign(list.get(), key_.get(), EVP_sha256());
     write(folder / "revoked.crl", [&](FILE* file) { PEM_write_X509_CRL(file, list.get()); });
   }
@@ -117,9 +125,11 @@ class Authority {
     return made;
   }
 
-  static void add(X509* certificate, int extension, const std::string& value) {
+  void add(X509* certificate, int extension, const std::string& value) const {
     if (value.empty()) return;
-    X509_EXTENSION* made = X509V3_EXT_conf_nid(nullptr, nullptr, extension, value.c_str());
+    X509V3_CTX context{};
+    X509V3_set_ctx(&context, certificate_.get(), certificate, nullptr, nullptr, 0);
+    X509_EXTENSION* made = X509V3_EXT_conf_nid(nullptr, &context, extension, value.c_str());
     X509_add_ext(certificate, made, -1);
     X509_EXTENSION_free(made);
   }

@@ -12,6 +12,7 @@
 #include <iterator>
 
 #include "tests/process/dssmctl/ctl_test.hpp"
+#include "tests/support/authority.hpp"
 
 namespace dssm::test {
 namespace {
@@ -227,6 +228,40 @@ TEST_F(Pki, InstallRefusesListsOfSomeOfItsCasOnly) {
   EXPECT_FALSE(std::filesystem::exists(host_ + "/ca.crt"));
   install(bundle + contents(other_ca + "/revoked.crl"));
   EXPECT_EQ(show(host_)["revocation_lists"].size(), 2u);
+}
+
+// While one CA replaces another.
+TEST_F(Pki, InstallTellsCasOfOneNameApart) {
+  const std::string other_ca = folder_ + "/ca2";
+  must({"init", "--ca", other_ca, "--name", "truck"});
+  const std::string bundle = issue(request(host_)) + contents(other_ca + "/ca.crt");
+  refused({"install", "-", "--credentials", host_}, "no revocation list of", bundle);
+  install(bundle + contents(other_ca + "/revoked.crl"));
+  const std::string newer = must({"revoke", "pc2", "--ca", ca_});
+  const Finished finished =
+      pki({"install", "-", "--credentials", host_}, newer + contents(other_ca + "/revoked.crl"));
+  EXPECT_EQ(finished.exit_status, 0) << finished.err;
+  EXPECT_FALSE(contains(finished.err, "it is kept")) << finished.err;
+  EXPECT_EQ(show(host_)["revocation_lists"].size(), 2u);
+  EXPECT_EQ(own_state(), "revoked");
+}
+
+TEST_F(Pki, InstallKeepsTheListsOfIntermediateCas) {
+  Authority root("root"), below("below", &root);
+  const long serial = below.issue(Authority::host("pc2"), host_);
+  const auto list_of = [&](Authority& ca, long revoked) {
+    ca.write_revoked(revoked, folder_);
+    return contents(folder_ + "/revoked.crl");
+  };
+  const std::string of_root = list_of(root, 99), of_below = list_of(below, serial);
+  refused({"install", "-", "--credentials", host_}, "no revocation list of 'below'", of_root);
+  install(of_root + of_below);
+  install(of_root);
+  install(of_below);
+  const Json lists = show(host_)["revocation_lists"];
+  ASSERT_EQ(lists.size(), 2u);
+  for (const Json& list : lists) EXPECT_EQ(list["ok"], true) << list;
+  EXPECT_EQ(own_state(), "revoked");
 }
 
 TEST_F(Pki, ACaWorksOnlyWithTheListOfWhatItRevoked) {

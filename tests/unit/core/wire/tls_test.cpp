@@ -16,6 +16,7 @@
 #include <fstream>
 #include <numeric>
 #include <random>
+#include <sstream>
 #include <vector>
 
 #include "core/wire/tcp.hpp"
@@ -339,6 +340,41 @@ TEST_F(Tls, RefusesARevokedCertificate) {
   authority.write_revoked(serial, folder("pc2"));
   connect(TlsCredentials::load(folder("pc1")).value(), TlsCredentials::load(folder("pc2")).value());
   expect_refused("'pc1' is not accepted: certificate revoked", "certificate revoked");
+}
+
+// While one replaces the other.
+TEST_F(Tls, TakesTwoAuthoritiesOfOneNameAndTheListsOfBoth) {
+  Authority other;
+  const long serial = authority.issue(Authority::host("pc1"), folder("pc1"));
+  ASSERT_EQ(other.issue(Authority::host("pc2"), folder("pc2")), serial);
+  const auto of_both = [this](const char* file) {
+    std::stringstream text;
+    for (const char* name : {"pc1", "pc2"}) text << std::ifstream(folder(name) + file).rdbuf();
+    return text.str();
+  };
+  const auto write = [this](const char* file, const std::string& text) {
+    for (const char* name : {"pc1", "pc2"}) std::ofstream(folder(name) + file) << text;
+  };
+  write("/ca.crt", of_both("/ca.crt"));
+  for (const bool is_revoked : {false, true}) {
+    authority.write_revoked(99, folder("pc1"));
+    other.write_revoked(is_revoked ? serial : 99, folder("pc2"));
+    write("/revoked.crl", of_both("/revoked.crl"));
+    for (const std::string name : {"pc1", "pc2"}) {
+      const Result<Credentials> loaded = TlsCredentials::load(folder(name));
+      ASSERT_TRUE(loaded) << loaded.error().message;
+      const std::string problem = (*loaded)->own_problem();
+      const bool is_refused = problem.find("certificate revoked") != std::string::npos;
+      EXPECT_EQ(is_refused, is_revoked && name == "pc2") << problem;
+      EXPECT_EQ(is_refused, !problem.empty()) << problem;
+    }
+  }
+  authority.write_revoked(99, folder("pc1"));
+  const Result<Credentials> incomplete = TlsCredentials::load(folder("pc1"));
+  ASSERT_FALSE(incomplete);
+  EXPECT_NE(incomplete.error().message.find("holds 0 revocation lists of 'vehicle'"),
+            std::string::npos)
+      << incomplete.error().message;
 }
 
 TEST_F(Tls, RefusesAProgramThatPlaysAHost) {
