@@ -151,6 +151,8 @@ bool LocalService::is_only_user(const Client& client, const StreamId& id) const 
   const OpenTable::Counts counts = opens_.counts(**stream);
   return counts.writers == 1 && counts.readers == 0 && (*stream)->channels().empty() &&
          (*stream)->creator_pid() == client.identity->pid &&
+         // Another user's program may get that pid later, and those of other hosts have none.
+         (*stream)->account() == client.identity->account() &&
          opens_.is_writing(**stream, client.identity->number);
 }
 

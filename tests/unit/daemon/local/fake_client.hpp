@@ -35,8 +35,8 @@ struct LocalDaemon {
 // A client without a socket: what it is sent, decoded.
 class FakeClient final : public ClientOutput {
  public:
-  FakeClient(LocalService& service, std::int32_t pid)
-      : service_(service), number_(service.connect(program_of(pid), *this)) {}
+  FakeClient(LocalService& service, std::int32_t pid, std::uint32_t uid = 1000)
+      : service_(service), number_(service.connect(program_of(pid, uid), *this)) {}
   ~FakeClient() { service_.disconnect(number_); }
 
   void send(std::string bytes, std::vector<UniqueFd> descriptors) override {
@@ -109,10 +109,10 @@ class FakeClient final : public ClientOutput {
   bool wants_turn = false;
 
  private:
-  static Identity program_of(std::int32_t pid) {
+  static Identity program_of(std::int32_t pid, std::uint32_t uid) {
     Identity identity;
     identity.pid = pid;
-    identity.uid = 1000;
+    identity.uid = uid;
     return identity;
   }
 

@@ -636,6 +636,42 @@ TEST(LocalService, ReplacesNothingWhileItDoesNotKnowWhoHasWhatOpen) {
   EXPECT_TRUE(client.ask(sized_request("s", 25, 16)).opened().created());
 }
 
+// --- rights
+
+TEST(LocalService, LetsOnlyTheProgramThatCreatedAStreamRemoveIt) {
+  LocalDaemon daemon;
+  daemon.rights.set({parse_right("user:4711 create s").value(),  //
+                     parse_right("user:4712 write s").value()});
+  local::Request remove;
+  remove.mutable_remove()->mutable_id()->set_name("s");
+  ASSERT_TRUE(FakeClient(daemon.service, 5, 4711).greet().ask(create_request("s")).has_opened());
+  {
+    FakeClient same_pid(daemon.service, 5, 4712);  // when the creator has ended
+    ASSERT_TRUE(same_pid.greet().ask(open_request("s", true)).has_opened());
+    EXPECT_EQ(same_pid.ask(remove).failure().code(), "no_permission");
+  }
+  {
+    FakeClient other(daemon.service, 6, 4711);
+    ASSERT_TRUE(other.greet().ask(open_request("s", true)).has_opened());
+    EXPECT_EQ(other.ask(remove).failure().code(), "no_permission");
+  }
+  FakeClient creator(daemon.service, 5, 4711);
+  ASSERT_TRUE(creator.greet().ask(open_request("s", true)).has_opened());
+  EXPECT_TRUE(creator.ask(remove).has_done());
+}
+
+// Which has no pid, as a program of another pid namespace.
+TEST(LocalService, TakesNoProgramForTheCreatorOfAStreamOfAnotherHost) {
+  LocalDaemon daemon;
+  daemon.rights.set({parse_right("user:4711 write s").value()});
+  ASSERT_TRUE(daemon.registry.create({"s", 0, ""}, odometry_type(), kHistory, 0, "host 'pc2'"));
+  FakeClient of_other_namespace(daemon.service, 0, 4711);
+  ASSERT_TRUE(of_other_namespace.greet().ask(open_request("s", true)).has_opened());
+  local::Request remove;
+  remove.mutable_remove()->mutable_id()->set_name("s");
+  EXPECT_EQ(of_other_namespace.ask(remove).failure().code(), "no_permission");
+}
+
 // --- recovery
 
 // A client's answer to a Create by an earlier dssmd: what it can offer now.
