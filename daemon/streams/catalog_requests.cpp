@@ -161,6 +161,13 @@ Result<OpenedRing> CatalogRequests::create_untrusted(const proto::Create& reques
       return error;
     }
   }
+  // A description is for all programs: one that may only write joins the stream as it is.
+  const bool may_describe =
+      rights.check(who, Action::create, id) || rights.check(who, Action::describe, id);
+  if (existing && !may_describe) {
+    DSSM_TRY((*existing)->type().check_usable_as(type), "stream '" + (*existing)->id().str() + "'");
+    return OpenedRing{*existing, false};
+  }
   return registry_.create(id, type, history, who.pid, who.account());
 }
 

@@ -672,6 +672,29 @@ TEST(LocalService, TakesNoProgramForTheCreatorOfAStreamOfAnotherHost) {
   EXPECT_EQ(of_other_namespace.ask(remove).failure().code(), "no_permission");
 }
 
+TEST(LocalService, TakesNoDescriptionFromAProgramThatMayOnlyWrite) {
+  LocalDaemon daemon;
+  const TypeInfo type = odometry_type();
+  const auto stream =
+      daemon.registry.create({"odometry", 0, ""}, {"", type.payload_bytes, 1, {}}, kHistory, 1);
+  ASSERT_TRUE(stream);
+  FakeClient program(daemon.service, 6, 4711);
+  program.greet();
+  daemon.rights.set({parse_right("user:4711 write odometry").value()});
+  EXPECT_TRUE(program.ask(create_request("odometry")).has_opened());
+  EXPECT_EQ(stream->stream->type().name, "");
+  EXPECT_EQ(program.ask(sized_request("odometry", 25, 16)).failure().code(), "type_mismatch");
+  for (const char* verb : {"create", "property"}) {
+    daemon.rights.set({parse_right("user:4711 write odometry").value(),
+                       parse_right(std::string("user:4711 ") + verb + " odometry").value()});
+    ASSERT_TRUE(daemon.registry.remove({"odometry", 0, ""}));
+    const auto fresh =
+        daemon.registry.create({"odometry", 0, ""}, {"", type.payload_bytes, 1, {}}, kHistory, 1);
+    EXPECT_TRUE(program.ask(create_request("odometry")).has_opened());
+    EXPECT_EQ(fresh->stream->type(), type) << verb;
+  }
+}
+
 // --- recovery
 
 // A client's answer to a Create by an earlier dssmd: what it can offer now.
