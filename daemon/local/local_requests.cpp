@@ -167,6 +167,7 @@ Result<Reply> LocalRequests::offer(const Client& client, const local::Offer& req
   DSSM_TRY(opens_.check_quota(*client));
   // An offer without a host is of this one: it may not know the stream after its restart.
   const bool is_own = id.host.empty() || !is_elsewhere(id);
+  files.may_create = rights_.check(*client, Action::create, id).has_value();
   const std::shared_ptr<Stream> stream =
       DSSM_TRY(is_own ? registry_.adopt_untrusted(id, std::move(files))
                       : fleet_->adopt_untrusted(id, role, std::move(files), client->account()));

@@ -171,11 +171,13 @@ void RemoteStream::open(const CreatePlan* plan, Then then, bool waits_for_histor
 
 Result<std::shared_ptr<Stream>> RemoteStream::adopt_untrusted(OfferedFiles&& files) {
   const std::string context = "stream '" + name_ + "'";
+  const bool may_create = files.may_create;
   if (const std::shared_ptr<Stream> ring = stream()) {
     if (!ring->is_ring(files.ring.get())) {
       return Error{Errc::conflict, context + " has another ring here now; close it and reopen it"};
     }
     ring->take_doorbell_untrusted(files.client, std::move(files.doorbell));
+    if (may_create) allow_create();
     return acquire();
   }
   std::shared_ptr<Stream> offered =
@@ -186,6 +188,7 @@ Result<std::shared_ptr<Stream>> RemoteStream::adopt_untrusted(OfferedFiles&& fil
                                              context, offered->id().str())};
   }
   DSSM_TRY(use_offered(std::move(offered)), context);
+  if (may_create) allow_create();
   return acquire();
 }
 

@@ -224,6 +224,8 @@ class RemoteStream : private Dialer::Observer, protected channel::ChannelClient:
   virtual Result<void> check_open(const CreatePlan* plan) = 0;
   // Takes the ring of a program.
   virtual Result<void> use_offered(std::shared_ptr<Stream> stream) = 0;
+  // A program that offered the ring has the right to create the stream at its owner.
+  virtual void allow_create() {}
   // There is a ring, and no program uses it or waits for it.
   virtual void on_unused() = 0;
 

@@ -98,9 +98,7 @@ Result<void> RemoteWriter::use_offered(std::shared_ptr<Stream> stream) {
   std::unique_ptr<OutgoingRing> ring = DSSM_TRY(OutgoingRing::open(std::move(stream)));
   const ring::RingMapping& mapping = ring->mapping();
   history_ = {mapping.geometry().depth, mapping.identity().cycle};
-  DSSM_TRY(use_ring(std::move(ring)));
-  creates_ = true;  // perhaps a program only opened it: then that one gets its stream back too
-  return {};
+  return use_ring(std::move(ring));
 }
 
 Result<void> RemoteWriter::use_ring(std::unique_ptr<OutgoingRing> ring) {

@@ -55,6 +55,8 @@ class RemoteWriter final : public RemoteStream,
   std::shared_ptr<Stream> stream() const noexcept override;
   Result<void> check_open(const CreatePlan* plan) override;
   Result<void> use_offered(std::shared_ptr<Stream> stream) override;
+  // Perhaps the program only opened it: then it gets its stream back too.
+  void allow_create() override { creates_ = true; }
   void on_unused() override { drain_timer_.enable_in(Duration::zero()); }
 
   void on_connected(const wire::Greeting& them) override;

@@ -38,6 +38,7 @@ struct OfferedFiles {
   UniqueFd ring, bell, meta;
   UniqueFd doorbell;  // may be missing
   ClientNumber client = 0;
+  bool may_create = false;  // the client has the right to create the stream, of another host
 };
 
 // Notified of a stream's doorbells: eventfds that its writers write to while the ring requests it.

@@ -48,6 +48,7 @@ class FakeFleet final : public Fleet {
                                                   const std::string&) override {
     asked.push_back(std::string("adopt ") + (role == Role::writer ? "writer " : "reader ") +
                     id.str());
+    offered_by_creator = files.may_create;
     return owner.adopt_untrusted(id, std::move(files));
   }
   void forward(const StreamId& id, const local::Request& request,
@@ -125,6 +126,7 @@ class FakeFleet final : public Fleet {
   Then<std::shared_ptr<Stream>> reader_then;
   Then<OpenedRing> writer_then;
   std::optional<CreatePlan> writer_plan;
+  bool offered_by_creator = false;
   std::vector<Then<std::vector<proto::Stream>>> list_then;
   std::vector<StreamInfo> known;  // in the order of hosts, names and ids
   std::vector<ClockPair> pairs;
@@ -572,6 +574,25 @@ TEST_F(RecoveringRequestsTest, GiveBackWhatBelongsToAnotherHost) {
   EXPECT_TRUE(opens.entries().begin()->second.any_host) << "as it was opened";
   EXPECT_TRUE(registry.streams().empty()) << "it is none of ours";
   EXPECT_EQ(client->ask(offer).failure().code(), "protocol") << "without its descriptors";
+}
+
+TEST_F(RecoveringRequestsTest, GiveBackWithTheRightsOfTheProgram) {
+  local::Request offer;
+  offer.mutable_offer()->mutable_id()->set_name("lidar");
+  offer.mutable_offer()->mutable_id()->set_host("pc2");
+  offer.mutable_offer()->set_for_writing(true);
+  for (const char* verb : {"write", "create"}) {
+    rights.set({parse_right(std::string("user:4711 ") + verb + " lidar").value()});
+    Registry before("pc2", kLimits);
+    const auto stream = before.create({"lidar", 0, ""}, odometry_type(), kHistory, 1)->stream;
+    FakeClient program(service, 6, 4711);
+    program.greet();
+    program.offered.push_back(stream->descriptors_for(Role::writer).value());
+    const local::Response answer = program.ask(offer);
+    EXPECT_TRUE(answer.has_opened()) << answer.failure().message();
+    EXPECT_EQ(fleet.offered_by_creator, std::string_view(verb) == "create");
+    ASSERT_TRUE(fleet.owner.remove({"lidar", 0, ""}));
+  }
 }
 
 }  // namespace

@@ -375,6 +375,28 @@ TEST_F(RemoteWritersTest, ContinuesWithARingThatAProgramKept) {
   until_published(4);
 }
 
+TEST_F(RemoteWritersTest, CreatesTheStreamOfAKeptRingOnlyForAProgramThatMayCreateIt) {
+  std::optional<Program> program;
+  {
+    const std::shared_ptr<Stream> stream = opened();
+    program.emplace(*stream);
+    streams.reset();
+  }
+  const auto offer = [&](bool may_create) {
+    OfferedFiles files = program->offer();
+    files.may_create = may_create;
+    auto stream = streams->adopt_untrusted(kOdometry, std::move(files));
+    EXPECT_TRUE(stream) << stream.error().message;
+    return *stream;
+  };
+  streams = std::make_unique<RemoteStreams<RemoteWriter>>(parts, catalog);
+  const std::shared_ptr<Stream> joined = offer(false);
+  EXPECT_TRUE(owner->receive().has_open());
+  EXPECT_EQ(offer(true), joined);
+  owner->cut();
+  EXPECT_TRUE(owner->receive().has_create());
+}
+
 // Somebody opened the stream before the program came back: no sample of either may get lost.
 TEST_F(RemoteWritersTest, PublishesAKeptRingBesideOneThatWasOpenedSince) {
   std::optional<Program> program;
