@@ -177,8 +177,6 @@ FleetService::~FleetService() {
 
 // --- finding owners
 
-// Continues when the owner of `id` is known, or when it is clear that there is none.
-//   bytes  that wait meanwhile
 void FleetService::when_known(const StreamId& id, std::size_t bytes, std::function<void()> go_on) {
   const bool known = !id.host.empty() && catalog_.find_host(id.host);
   const bool is_full = early_.size() >= kMaxEarlyRequests || early_bytes_ + bytes > kMaxEarlyBytes;
@@ -217,30 +215,28 @@ Mirror* FleetService::mirror_without_owner(const StreamId& id) const {
 
 void FleetService::open_reader(const StreamId& id, bool history, const std::string& account,
                                Then<std::shared_ptr<Stream>> then) {
-  when_known(id, 0, [this, id, history, account, then = std::move(then)]() mutable {
-    const Result<const KnownHost*> owner = catalog_.find_owner(id);
-    if (owner) {
-      const StreamId named = owned_by(**owner, id);
-      const auto want = [&] {
-        Mirror* mirror = history ? mirrors_.find(named) : nullptr;
-        if (mirror) mirror->want_history(0, true);
-      };
-      want();  // so that open() waits for it
-      mirrors_.open(
-          **owner, id, nullptr,
-          [then = std::move(then)](Result<OpenedRing> ring) {
-            if (!ring) return then(std::move(ring).error());
-            then(std::move(ring->stream));
-          },
-          account, history);
-      return want();  // of a new mirror, which is not connected yet
-    }
-    if (Mirror* mirror = mirror_without_owner(id)) {
-      if (history) mirror->want_history(0, true);
-      if (std::shared_ptr<Stream> stream = mirror->acquire()) return then(std::move(stream));
-    }
-    then(with_unavailable_peers(owner.error()));
-  });
+  const Result<const KnownHost*> owner = catalog_.find_owner(id);
+  if (owner) {
+    const StreamId named = owned_by(**owner, id);
+    const auto want = [&] {
+      Mirror* mirror = history ? mirrors_.find(named) : nullptr;
+      if (mirror) mirror->want_history(0, true);
+    };
+    want();  // so that open() waits for it
+    mirrors_.open(
+        **owner, id, nullptr,
+        [then = std::move(then)](Result<OpenedRing> ring) {
+          if (!ring) return then(std::move(ring).error());
+          then(std::move(ring->stream));
+        },
+        account, history);
+    return want();  // of a new mirror, which is not connected yet
+  }
+  if (Mirror* mirror = mirror_without_owner(id)) {
+    if (history) mirror->want_history(0, true);
+    if (std::shared_ptr<Stream> stream = mirror->acquire()) return then(std::move(stream));
+  }
+  then(with_unavailable_peers(owner.error()));
 }
 
 void FleetService::want_history(const StreamId& id, Tid from, bool always) {
@@ -249,14 +245,9 @@ void FleetService::want_history(const StreamId& id, Tid from, bool always) {
 
 void FleetService::open_writer(const StreamId& id, const CreatePlan* plan,
                                const std::string& account, Then<OpenedRing> then) {
-  const std::optional<CreatePlan> kept = plan ? std::optional(*plan) : std::nullopt;
-  // Names of fields are short.
-  const std::size_t bytes = plan ? plan->type.fields.size() * sizeof(Field) : 0;
-  when_known(id, bytes, [this, id, kept, account, then = std::move(then)]() mutable {
-    const Result<const KnownHost*> owner = catalog_.find_owner(id);
-    if (!owner) return then(with_unavailable_peers(owner.error()));
-    writers_.open(**owner, id, kept ? &*kept : nullptr, std::move(then), account);
-  });
+  const Result<const KnownHost*> owner = catalog_.find_owner(id);
+  if (!owner) return then(with_unavailable_peers(owner.error()));
+  writers_.open(**owner, id, plan, std::move(then), account);
 }
 
 Result<std::shared_ptr<Stream>> FleetService::adopt_untrusted(const StreamId& id, Role role,
@@ -280,23 +271,21 @@ std::optional<local::Response> FleetService::describe_mirror(const StreamId& id)
 
 void FleetService::forward(const StreamId& id, const local::Request& request,
                            Then<local::Response> then) {
-  when_known(id, request.ByteSizeLong(), [this, id, request, then = std::move(then)]() mutable {
-    const Result<const KnownHost*> owner = catalog_.find_owner(id);
-    if (!owner) {
-      // Info of a mirror whose owner is unavailable comes from here.
-      auto mirror = request.has_info() ? describe_mirror(id) : std::nullopt;
-      return mirror ? then(*std::move(mirror)) : then(with_unavailable_peers(owner.error()));
-    }
-    const StreamId named = owned_by(**owner, id);
-    // A host in the catalog has a connection.
-    peers_.connection_to((*owner)->greeting.host_id)
-        ->ask(network_request(named, request), [this, named, body = request.body_case(),
-                                                then = std::move(then)](Result<net::Frame> answer) {
-          if (answer) return then(response_to(body, named, *std::move(answer)));
-          auto mirror = body == local::Request::kInfo ? describe_mirror(named) : std::nullopt;
-          mirror ? then(*std::move(mirror)) : then(std::move(answer).error());
-        });
-  });
+  const Result<const KnownHost*> owner = catalog_.find_owner(id);
+  if (!owner) {
+    // Info of a mirror whose owner is unavailable comes from here.
+    auto mirror = request.has_info() ? describe_mirror(id) : std::nullopt;
+    return mirror ? then(*std::move(mirror)) : then(with_unavailable_peers(owner.error()));
+  }
+  const StreamId named = owned_by(**owner, id);
+  // A host in the catalog has a connection.
+  peers_.connection_to((*owner)->greeting.host_id)
+      ->ask(network_request(named, request), [this, named, body = request.body_case(),
+                                              then = std::move(then)](Result<net::Frame> answer) {
+        if (answer) return then(response_to(body, named, *std::move(answer)));
+        auto mirror = body == local::Request::kInfo ? describe_mirror(named) : std::nullopt;
+        mirror ? then(*std::move(mirror)) : then(std::move(answer).error());
+      });
 }
 
 Result<local::Response> FleetService::response_to(local::Request::BodyCase request,
@@ -548,20 +537,18 @@ local::Mdns FleetService::mdns() const {
 }
 
 void FleetService::ping(const std::string& host, Then<local::RoundTrip> then) {
-  when_known({"", 0, host}, host.size(), [this, host, then = std::move(then)]() mutable {
-    const Result<const KnownHost*> known = catalog_.find_host(host);
-    if (!known) return then(with_unavailable_peers(known.error()));
-    PeerConnection& link = *peers_.connection_to((*known)->greeting.host_id);
-    net::Frame request;
-    wire::send_clock(self_.greeting, *request.mutable_ping()->mutable_clock());
-    link.ask(std::move(request), [address = link.address(), &loop = loop_, sent = loop_.now(),
-                                  then = std::move(then)](Result<net::Frame> answer) {
-      if (!answer) return then(std::move(answer).error());
-      local::RoundTrip round_trip;
-      round_trip.set_round_trip_ns(to_ns(loop.now() - sent));
-      round_trip.set_address(address);
-      then(std::move(round_trip));
-    });
+  const Result<const KnownHost*> known = catalog_.find_host(host);
+  if (!known) return then(with_unavailable_peers(known.error()));
+  PeerConnection& link = *peers_.connection_to((*known)->greeting.host_id);
+  net::Frame request;
+  wire::send_clock(self_.greeting, *request.mutable_ping()->mutable_clock());
+  link.ask(std::move(request), [address = link.address(), &loop = loop_, sent = loop_.now(),
+                                then = std::move(then)](Result<net::Frame> answer) {
+    if (!answer) return then(std::move(answer).error());
+    local::RoundTrip round_trip;
+    round_trip.set_round_trip_ns(to_ns(loop.now() - sent));
+    round_trip.set_address(address);
+    then(std::move(round_trip));
   });
 }
 

@@ -60,6 +60,7 @@ class FleetService final : public Fleet, private CatalogObserver {
   bool is_there(const StreamId& id) const override {
     return id.host.empty() ? catalog_.find_owner(id).has_value() : catalog_.has(id);
   }
+  void when_known(const StreamId& id, std::size_t bytes, std::function<void()> go_on) override;
   void open_reader(const StreamId& id, bool history, const std::string& account,
                    Then<std::shared_ptr<Stream>> then) override;
   void want_history(const StreamId& id, Tid from, bool always) override;
@@ -96,7 +97,6 @@ class FleetService final : public Fleet, private CatalogObserver {
 
   Result<local::Response> response_to(local::Request::BodyCase request, const StreamId& id,
                                       net::Frame answer) const;
-  void when_known(const StreamId& id, std::size_t bytes, std::function<void()> go_on);
   void answer_early();
   Error with_unavailable_peers(Error error) const;
   Mirror* mirror_without_owner(const StreamId& id) const;

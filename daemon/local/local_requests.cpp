@@ -263,6 +263,14 @@ Reply LocalRequests::get_daemon(const Client& client) const {
 
 // --- other hosts
 
+std::optional<StreamId> LocalRequests::asked_untrusted(const local::Request& request) const {
+  if (request.has_ping_host()) return StreamId{"", 0, request.ping_host().host()};
+  const proto::StreamId* named = subject(request);
+  if (!named) return std::nullopt;
+  const Result<StreamId> id = wire::stream_id_untrusted(*named);
+  return id ? std::optional(*id) : std::nullopt;
+}
+
 void LocalRequests::ask_hosts_untrusted(const Client& client, const local::Request& request,
                                         Answer answer) {
   if (request.has_list()) return list_all(std::move(answer));

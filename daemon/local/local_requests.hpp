@@ -10,6 +10,7 @@
 #include <dssm/stream.hpp>
 #include <functional>
 #include <memory>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -62,6 +63,12 @@ class Fleet {
   // Whether the other host that `id` names is there and has such a stream; without a host: whether
   // exactly one other host has one.
   virtual bool is_there(const StreamId& id) const = 0;
+
+  // Continues when it is known who owns `id`, or that nobody does: before that, what follows could
+  // fail without a reason.
+  //   id     the stream, or only the host that is asked about
+  //   bytes  that wait meanwhile
+  virtual void when_known(const StreamId& id, std::size_t bytes, std::function<void()> go_on) = 0;
 
   // The mirror of a stream, with its newest sample. Kept while its Stream is in the OpenTable, and
   // some seconds longer.
@@ -146,6 +153,9 @@ class LocalRequests {
   // a ListNodes, a ListClockPairs, a PingHost, or about a stream of another host. Offers,
   // WantHistory and ListRights never do.
   bool waits_for_hosts(const local::Request& request) const;
+
+  // The stream of another host that such a request is about, or only that host; nullopt: all hosts.
+  std::optional<StreamId> asked_untrusted(const local::Request& request) const;
 
   // Serves a request that waits for other hosts,
   void ask_hosts_untrusted(const Client& client, const local::Request& request, Answer answer);

@@ -105,7 +105,7 @@ bool LocalService::on_frame_untrusted(ClientNumber number, std::span<const std::
                   {Errc::protocol, "the first request on a connection has to be Hello"});
   }
   if (!client.has_reader && !changes_something(request)) return true;
-  if (Result<void> allowed = check_access(client, request); !allowed) {
+  if (Result<void> allowed = check_access(*client.identity, request); !allowed) {
     send_failure(client, serial, allowed.error());
   } else if (must_wait(request)) {
     defer(client, request, frame.size());
@@ -117,7 +117,8 @@ bool LocalService::on_frame_untrusted(ClientNumber number, std::span<const std::
   return true;
 }
 
-Result<void> LocalService::check_access(const Client& client, const local::Request& request) {
+Result<void> LocalService::check_access(const ClientIdentity& client,
+                                        const local::Request& request) {
   const std::optional<Action> action = action_of(request);
   if (!action) return unknown_request(registry_.host());
   StreamId stream;
@@ -128,13 +129,12 @@ Result<void> LocalService::check_access(const Client& client, const local::Reque
   if (*action == Action::remove && is_only_user(client, stream)) return {};
   Result<void> checked =
       *action == Action::create
-          ? rights_.check_create(*client.identity, stream, exists(stream), Action::open_for_writing)
-          : rights_.check(*client.identity, *action, stream);
+          ? rights_.check_create(client, stream, exists(stream), Action::open_for_writing)
+          : rights_.check(client, *action, stream);
   if (!checked) {
-    refusals_.warning("refuse a request: " + checked.error().message,
-                      {.stream = stream.str(),
-                       .peer = client.identity->str(),
-                       .message_id = message_id::kRequestRefused});
+    refusals_.warning(
+        "refuse a request: " + checked.error().message,
+        {.stream = stream.str(), .peer = client.str(), .message_id = message_id::kRequestRefused});
   }
   return checked;
 }
@@ -145,15 +145,14 @@ bool LocalService::exists(const StreamId& id) const {
   return fleet_ && fleet_->is_there(id);
 }
 
-bool LocalService::is_only_user(const Client& client, const StreamId& id) const {
+bool LocalService::is_only_user(const ClientIdentity& client, const StreamId& id) const {
   const Result<std::shared_ptr<Stream>> stream = registry_.find(id);
   if (!stream) return false;
   const OpenTable::Counts counts = opens_.counts(**stream);
   return counts.writers == 1 && counts.readers == 0 && (*stream)->channels().empty() &&
-         (*stream)->creator_pid() == client.identity->pid &&
+         (*stream)->creator_pid() == client.pid &&
          // Another user's program may get that pid later, and those of other hosts have none.
-         (*stream)->account() == client.identity->account() &&
-         opens_.is_writing(**stream, client.identity->number);
+         (*stream)->account() == client.account() && opens_.is_writing(**stream, client.number);
 }
 
 bool LocalService::refuse(const Client& client, std::uint64_t serial, const Error& error) {
@@ -197,7 +196,7 @@ void LocalService::serve(ClientNumber number, const local::Request& request,
   const auto identity = clients_.at(number).identity;
   if (requests_.waits_for_hosts(request)) {
     if (const LocalRequests::Answer answer = await(number, request.serial())) {
-      requests_.ask_hosts_untrusted(identity, request, answer);
+      ask_hosts(identity, request, answer);
     }
     return;
   }
@@ -207,6 +206,19 @@ void LocalService::serve(ClientNumber number, const local::Request& request,
   while (tell_news(number, end_of_news())) {
   }
   on_answer(number, request.serial(), std::move(reply));
+}
+
+void LocalService::ask_hosts(const std::shared_ptr<const ClientIdentity>& client,
+                             const local::Request& request, const LocalRequests::Answer& answer) {
+  const std::optional<StreamId> asked = requests_.asked_untrusted(request);
+  if (!asked) return requests_.ask_hosts_untrusted(client, request, answer);
+  fleet_->when_known(*asked, request.ByteSizeLong(), [this, client, request, answer] {
+    // The rights may have changed meanwhile.
+    if (Result<void> allowed = check_access(*client, request); !allowed) {
+      return answer(std::move(allowed).error());
+    }
+    requests_.ask_hosts_untrusted(client, request, answer);
+  });
 }
 
 // Takes the response of another host to the client; none when this client waits for too many
@@ -644,7 +656,7 @@ bool LocalService::serve_deferred(ClientNumber number) {
   client.deferred.erase(ready);
   client.deferred_bytes -= next.bytes;
   // The rights may have changed meanwhile.
-  if (Result<void> allowed = check_access(client, next.request); !allowed) {
+  if (Result<void> allowed = check_access(*client.identity, next.request); !allowed) {
     send_failure(client, next.request.serial(), allowed.error());
   } else {
     DescriptorQueue none;

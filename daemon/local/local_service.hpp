@@ -155,11 +155,13 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   };
 
   bool refuse(const Client& client, std::uint64_t serial, const Error& error);
-  Result<void> check_access(const Client& client, const local::Request& request);
+  Result<void> check_access(const ClientIdentity& client, const local::Request& request);
   bool exists(const StreamId& id) const;
-  bool is_only_user(const Client& client, const StreamId& id) const;
+  bool is_only_user(const ClientIdentity& client, const StreamId& id) const;
   bool greet(Client& client, std::uint64_t serial, const proto::Hello& hello);
   void serve(ClientNumber number, const local::Request& request, DescriptorQueue& descriptors);
+  void ask_hosts(const std::shared_ptr<const ClientIdentity>& client, const local::Request& request,
+                 const LocalRequests::Answer& answer);
   LocalRequests::Answer await(ClientNumber number, std::uint64_t serial);
   void on_answer(ClientNumber number, std::uint64_t serial, Result<Reply> reply);
   void log_offer(const ClientIdentity& client, const local::Offer& offer,

@@ -57,13 +57,8 @@ TEST_F(FleetServiceTest, ReportsThatMdnsIsOffUntilItsFirstState) {
 TEST_F(FleetServiceTest, AnswersWhatWaitedForThePeersInTurns) {
   constexpr int kRequests = 3 * FleetService::kEarlyPerTurn;
   int answered = 0, before = 0, most = 0;
-  local::Request request;
-  request.mutable_info();
   for (int i = 0; i < kRequests; ++i) {
-    fleet->forward({"nothing", 0, ""}, request, [&](const Result<local::Response>& answer) {
-      EXPECT_FALSE(answer);
-      ++answered;
-    });
+    fleet->when_known({"nothing", 0, ""}, 100, [&] { ++answered; });
   }
   EXPECT_EQ(answered, 0);
   run_until(loop, [&] {
@@ -74,26 +69,13 @@ TEST_F(FleetServiceTest, AnswersWhatWaitedForThePeersInTurns) {
 }
 
 TEST_F(FleetServiceTest, BoundsWhatWaitsForThePeers) {
+  constexpr std::size_t kBytes = 1U << 20;
   std::size_t requests = 0;
-  bool is_answered = false;
-  local::Request request;
-  request.mutable_set_property()->set_property(std::string(1U << 20, 'x'));
-  for (; !is_answered && requests < 100; ++requests) {
-    fleet->forward({"nothing", 0, ""}, request,
-                   [&](const Result<local::Response>&) { is_answered = true; });
+  bool goes_on = false;
+  for (; !goes_on && requests < 100; ++requests) {
+    fleet->when_known({"nothing", 0, ""}, kBytes, [&] { goes_on = true; });
   }
-  EXPECT_EQ(requests, FleetService::kMaxEarlyBytes >> 20);
-}
-
-TEST_F(FleetServiceTest, BoundsTheNamesOfHostsThatWaitForThePeers) {
-  constexpr std::size_t kNameBytes = 1U << 20;
-  std::size_t requests = 0;
-  bool is_answered = false;
-  for (; !is_answered && requests < 100; ++requests) {
-    fleet->ping(std::string(kNameBytes, 'x'),
-                [&](const Result<local::RoundTrip>&) { is_answered = true; });
-  }
-  EXPECT_EQ(requests, FleetService::kMaxEarlyBytes / kNameBytes + 1);
+  EXPECT_EQ(requests, FleetService::kMaxEarlyBytes / kBytes + 1);
 }
 
 TEST_F(FleetServiceTest, ReportsTheNewestStateOfMdns) {

@@ -28,6 +28,10 @@ class FakeFleet final : public Fleet {
  public:
   void observe(Observer* who) override { observer = who; }
   bool is_there(const StreamId& id) const override { return there.contains(id.str()); }
+  void when_known(const StreamId&, std::size_t, std::function<void()> go_on) override {
+    if (!knows_hosts) return waiting.push_back(std::move(go_on));
+    go_on();
+  }
   void open_reader(const StreamId& id, bool history, const std::string&,
                    Then<std::shared_ptr<Stream>> then) override {
     asked.push_back("open_reader " + id.str() + (history ? " with history" : ""));
@@ -128,6 +132,8 @@ class FakeFleet final : public Fleet {
   std::optional<CreatePlan> writer_plan;
   bool offered_by_creator = false;
   std::vector<Then<std::vector<proto::Stream>>> list_then;
+  bool knows_hosts = true;
+  std::vector<std::function<void()>> waiting;  // until it does
   std::vector<StreamInfo> known;  // in the order of hosts, names and ids
   std::vector<ClockPair> pairs;
   std::set<std::string> there;
@@ -414,6 +420,22 @@ TEST_F(RemoteRightsTest, ReachAsFarAtAnotherHostAsHere) {
     fleet.writer_then(OpenedRing{fleet.ring("lidar"), false});
     EXPECT_TRUE(client->next().has_opened()) << verbs;
   }
+}
+
+TEST_F(RemoteRightsTest, CountWhenTheHostIsKnown) {
+  fleet.knows_hosts = false;
+  fleet.there = {"lidar:0@pc2"};
+  allow("user:1000 remove,create,property lidar");
+  local::Request remove;
+  remove.mutable_remove()->mutable_id()->set_name("lidar");
+  remove.mutable_remove()->mutable_id()->set_host("pc2");
+  put(remove, 50);
+  put(create_at("pc2"), 51);
+  allow("user:1000 write lidar");
+  for (const auto& go_on : fleet.waiting) go_on();
+  EXPECT_EQ(client->next().failure().code(), "no_permission");
+  EXPECT_EQ(fleet.asked, Asked{"open_writer lidar:0@pc2 depth 16"});
+  EXPECT_EQ(fleet.writer_plan->scope, CreatePlan::Scope::join);
 }
 
 // The catalog still had it.
