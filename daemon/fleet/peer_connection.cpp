@@ -127,18 +127,24 @@ void PeerConnection::on_down(const Error& error) {
 }
 
 void PeerConnection::ask(net::Frame request, Then then) {
+  const bool is_full = requests_.waiting.size() >= kMaxWaiting ||
+                       requests_.bytes + request.ByteSizeLong() > kMaxWaitingBytes;
+  if (is_full && dialer_.connection()) {
+    return then(Error{Errc::limit_exceeded,
+                      fmt::format("host '{}' has not answered {} requests of this host's programs "
+                                  "yet; retry in a second",
+                                  them_->host, requests_.waiting.size())});
+  }
+  send(std::move(request), std::move(then));
+}
+
+void PeerConnection::send(net::Frame request, Then then) {
   FrameConnection* link = dialer_.connection();
   if (!link || !link->is_open()) {
     return then(
         Error{Errc::unavailable, "the host at '" + address() + "' is not connected any more"});
   }
   const std::size_t bytes = request.ByteSizeLong();
-  if (requests_.waiting.size() >= kMaxWaiting || requests_.bytes + bytes > kMaxWaitingBytes) {
-    return then(Error{Errc::limit_exceeded,
-                      fmt::format("host '{}' has not answered {} requests of this host's programs "
-                                  "yet; retry in a second",
-                                  them_->host, requests_.waiting.size())});
-  }
   request.set_serial(requests_.next_serial++);
   requests_.bytes += bytes;
   requests_.waiting.emplace(request.serial(), Waiting{std::move(then), bytes});
@@ -216,8 +222,8 @@ void PeerConnection::ping() {
   ping.set_answered_ns(to_ns(std::exchange(answered_, {})));
   asked_ = RawClock::now();
   ping.set_raw_ns(to_ns(asked_));
-  ask(std::move(request), [this, now = loop_.now(), asked = asked_](
-                              const Result<net::Frame>& answer) { on_pong(now, asked, answer); });
+  send(std::move(request), [this, now = loop_.now(), asked = asked_](
+                               const Result<net::Frame>& answer) { on_pong(now, asked, answer); });
 }
 
 void PeerConnection::take_clock(std::shared_ptr<const wire::ClockReport> clock) {

@@ -22,7 +22,8 @@ namespace dssm::daemon {
 
 class PeerConnection final : private Dialer::Observer {
  public:
-  // Requests of one peer that wait for their answers.
+  // Requests of one peer that wait for their answers, and their bytes: not of its heartbeats, which
+  // programs cannot keep out.
   static constexpr std::size_t kMaxWaiting = 4096;
   static constexpr std::size_t kMaxWaitingBytes = 3U << 20;  // two properties of the largest size
 
@@ -141,6 +142,7 @@ class PeerConnection final : private Dialer::Observer {
   void on_up(FrameConnection& link, const wire::Greeting& them) override;
   Result<void> on_frame(net::Frame& frame) override;
   void on_down(const Error& error) override;
+  void send(net::Frame request, Then then);
   void beat();
   void ping();
   void take_clock(std::shared_ptr<const wire::ClockReport> clock);

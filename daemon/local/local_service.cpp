@@ -9,11 +9,18 @@
 #include "core/wire/frame.hpp"
 #include "core/wire/local_protocol.hpp"
 #include "core/wire/request_size.hpp"
+#include "daemon/base/limit_use.hpp"
 #include "daemon/base/message_ids.hpp"
+#include "daemon/fleet/peer_connection.hpp"
 #include "daemon/streams/catalog_requests.hpp"
 
 namespace dssm::daemon {
 namespace {
+
+// One user leaves half of what may wait for a peer to others, and may set the longest property.
+static_assert(2 * LocalService::kMaxAwaitedPerUser <= PeerConnection::kMaxWaiting);
+static_assert(2 * LocalService::kMaxAwaitedBytesPerUser <= PeerConnection::kMaxWaitingBytes);
+static_assert(LocalService::kMaxAwaitedBytesPerUser > wire::kMaxLocalRequestBytes);
 
 // Whether the request has an effect besides its answer.
 bool changes_something(const local::Request& request) noexcept {
@@ -36,6 +43,33 @@ local::Response failure_response(std::uint64_t serial, const Error& error) {
 }
 
 }  // namespace
+
+// Counts from its construction until end(). A request whose answer never comes, for lack of memory,
+// ends with the function that waits for it.
+class LocalService::AwaitedRequest {
+ public:
+  AwaitedRequest(std::shared_ptr<AwaitedOfUser> of_user, std::size_t bytes)
+      : of_user_(std::move(of_user)), bytes_(bytes) {
+    ++of_user_->requests;
+    of_user_->bytes += bytes_;
+  }
+  AwaitedRequest(const AwaitedRequest&) = delete;
+  AwaitedRequest& operator=(const AwaitedRequest&) = delete;
+  ~AwaitedRequest() { end(); }
+
+  // False: it has ended before.
+  bool end() noexcept {
+    if (!of_user_) return false;
+    --of_user_->requests;
+    of_user_->bytes -= bytes_;
+    of_user_.reset();
+    return true;
+  }
+
+ private:
+  std::shared_ptr<AwaitedOfUser> of_user_;
+  const std::size_t bytes_;
+};
 
 LocalService::LocalService(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock,
                            const Rights& rights, Logger& logger, Fleet* fleet)
@@ -195,7 +229,7 @@ void LocalService::serve(ClientNumber number, const local::Request& request,
   if (request.has_list_clients()) return list_clients(clients_.at(number), request.serial());
   const auto identity = clients_.at(number).identity;
   if (requests_.waits_for_hosts(request)) {
-    if (const LocalRequests::Answer answer = await(number, request.serial())) {
+    if (const LocalRequests::Answer answer = await(number, request)) {
       ask_hosts(identity, request, answer);
     }
     return;
@@ -221,26 +255,46 @@ void LocalService::ask_hosts(const std::shared_ptr<const ClientIdentity>& client
   });
 }
 
-// Takes the response of another host to the client; none when this client waits for too many
-// already: then it has got a failure.
-LocalRequests::Answer LocalService::await(ClientNumber number, std::uint64_t serial) {
+// Takes the response of another host to the client; none when this client or its user waits for too
+// many already: then it has got a failure.
+LocalRequests::Answer LocalService::await(ClientNumber number, const local::Request& request) {
   Client& client = clients_.at(number);
-  if (client.awaited >= kMaxAwaited) {
-    send_failure(
-        client, serial,
-        {Errc::limit_exceeded,
-         fmt::format("other hosts have not answered {} requests of this program yet; wait for them",
-                     kMaxAwaited)});
+  std::erase_if(awaited_, [](const auto& user) { return user.second.expired(); });
+  std::weak_ptr<AwaitedOfUser>& kept = awaited_[client.identity->uid];
+  std::shared_ptr<AwaitedOfUser> of_user = kept.lock();
+  if (!of_user) kept = of_user = std::make_shared<AwaitedOfUser>();
+  const std::size_t bytes = request.ByteSizeLong() + (request.has_ping_host() ? kPingBytes : 0);
+  if (Result<void> checked = check_awaited(client, *of_user, bytes); !checked) {
+    send_failure(client, request.serial(), checked.error());
     return {};
   }
   ++client.awaited;
-  // One for which there was no memory is followed by a failure.
-  const auto is_awaited = std::make_shared<bool>(true);
-  return [this, number, serial, is_awaited](Result<Reply> reply) {
+  const auto awaited = std::make_shared<AwaitedRequest>(std::move(of_user), bytes);
+  return [this, number, serial = request.serial(), awaited](Result<Reply> reply) {
     const auto asker = clients_.find(number);
-    if (std::exchange(*is_awaited, false) && asker != clients_.end()) --asker->second.awaited;
+    // One for which there was no memory is followed by a failure.
+    if (awaited->end() && asker != clients_.end()) --asker->second.awaited;
     on_answer(number, serial, std::move(reply));
   };
+}
+
+Result<void> LocalService::check_awaited(const Client& client, const AwaitedOfUser& of_user,
+                                         std::size_t bytes) const {
+  const auto error = [](const std::string& what) {
+    return Error{Errc::limit_exceeded,
+                 fmt::format("other hosts have not answered {} yet; wait for them", what)};
+  };
+  if (client.awaited >= kMaxAwaited) {
+    return error(fmt::format("{} requests of this program", kMaxAwaited));
+  }
+  if (!is_limited(client.identity->uid)) return {};
+  if (of_user.requests >= kMaxAwaitedPerUser) {
+    return error(fmt::format("{} requests of this user's programs", kMaxAwaitedPerUser));
+  }
+  if (of_user.bytes + bytes > kMaxAwaitedBytesPerUser) {
+    return error("1.5 MiB of requests of this user's programs");
+  }
+  return {};
 }
 
 void LocalService::on_answer(ClientNumber number, std::uint64_t serial, Result<Reply> reply) {

@@ -55,8 +55,13 @@ class ClientOutput {
 
 class LocalService final : private StreamObserver, private Fleet::Observer {
  public:
-  // Requests of one client that wait for other hosts.
+  // Requests of one client that wait for other hosts; and of all clients of one account, also those
+  // that have disconnected: half of what may wait for one peer.
   static constexpr std::size_t kMaxAwaited = 1024;
+  static constexpr std::size_t kMaxAwaitedPerUser = 2048;
+  static constexpr std::size_t kMaxAwaitedBytesPerUser = 3U << 19;
+  // What a ping counts: it takes this PC's clock along.
+  static constexpr std::size_t kPingBytes = 2U << 10;
   // What one client, and all clients of one account, may have deferred during recovery; each
   // request counts as so many bytes more than it has.
   static constexpr std::size_t kMaxDeferredBytes = 1U << 20;
@@ -153,6 +158,10 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
     bool may_serve_deferred = false;  // some of them may not have to wait any more
     std::size_t awaited = 0;          // answers of other hosts
   };
+  struct AwaitedOfUser {
+    std::size_t requests = 0, bytes = 0;
+  };
+  class AwaitedRequest;
 
   bool refuse(const Client& client, std::uint64_t serial, const Error& error);
   Result<void> check_access(const ClientIdentity& client, const local::Request& request);
@@ -162,7 +171,9 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   void serve(ClientNumber number, const local::Request& request, DescriptorQueue& descriptors);
   void ask_hosts(const std::shared_ptr<const ClientIdentity>& client, const local::Request& request,
                  const LocalRequests::Answer& answer);
-  LocalRequests::Answer await(ClientNumber number, std::uint64_t serial);
+  LocalRequests::Answer await(ClientNumber number, const local::Request& request);
+  Result<void> check_awaited(const Client& client, const AwaitedOfUser& of_user,
+                             std::size_t bytes) const;
   void on_answer(ClientNumber number, std::uint64_t serial, Result<Reply> reply);
   void log_offer(const ClientIdentity& client, const local::Offer& offer,
                  const Result<Reply>& reply);
@@ -209,6 +220,8 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   Fleet* fleet_;
   ClientNumber next_client_ = 1;
   std::map<ClientNumber, Client> clients_;
+  // By user id; kept by the requests that wait.
+  std::map<std::uint32_t, std::weak_ptr<AwaitedOfUser>> awaited_;
   std::deque<News> news_;  // that some client has not got
   std::uint64_t first_news_ = 0;
   // The number of the newest event that a property was set, by the stream's full name.

@@ -504,6 +504,24 @@ TEST_F(PeersTest, BoundTheRequestsThatWait) {
   EXPECT_FALSE(catalog.hosts().empty()) << "the connection does not suffer";
 }
 
+// Without them, the other host would seem to be dead.
+TEST_F(PeersTest, BeatWhileTooManyRequestsWait) {
+  one.delay = std::chrono::milliseconds(1);
+  start({&one});
+  wait_for_startup();
+  PeerConnection& link = *peers->connection_to(one.host().greeting.host_id);
+  wait([&] { return link.last_round_trip() > Duration::zero(); });  // no heartbeat waits
+  bool is_full = false;
+  while (!is_full) {
+    net::Frame request;
+    request.mutable_list();
+    link.ask(request, [&](const Result<net::Frame>& answer) { is_full = !answer; });
+  }
+  const int before = one.pings;
+  wait([&] { return one.pings == before + 3; });
+  EXPECT_EQ(one.connections(), 1) << "it is the connection of these requests";
+}
+
 TEST_F(PeersTest, TakeFurtherRequestsAfterEachAnswer) {
   start({&one});
   wait_for_startup();

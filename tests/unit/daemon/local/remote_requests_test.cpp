@@ -68,6 +68,7 @@ class FakeFleet final : public Fleet {
       response.mutable_property()->set_property("calibration");
     } else if (request.has_set_property()) {
       asked.push_back("set_property " + id.str() + " " + request.set_property().property());
+      if (!answers_properties) return unanswered.push_back(std::move(then));
       response.mutable_done();
     } else {
       asked.push_back("remove " + id.str());
@@ -134,6 +135,8 @@ class FakeFleet final : public Fleet {
   std::vector<Then<std::vector<proto::Stream>>> list_then;
   bool knows_hosts = true;
   std::vector<std::function<void()>> waiting;  // until it does
+  bool answers_properties = true;
+  std::vector<Then<local::Response>> unanswered;
   std::vector<StreamInfo> known;  // in the order of hosts, names and ids
   std::vector<ClockPair> pairs;
   std::set<std::string> there;
@@ -367,6 +370,59 @@ TEST_F(RemoteRequestsTest, BoundsWhatOneClientWaitsFor) {
   EXPECT_EQ(client->next().serial(), 1000u);
   put(list_request(), 51);
   EXPECT_TRUE(client->received.empty()) << "there is room again";
+}
+
+// Of the programs of a user with limits.
+class LimitedRequestsTest : public RemoteRequestsTest {
+ protected:
+  static constexpr std::uint32_t kUser = 4711;
+  std::unique_ptr<FakeClient> connect(std::uint32_t uid) {
+    auto program = std::make_unique<FakeClient>(service, 6, uid);
+    program->greet();
+    return program;
+  }
+  static void put(FakeClient& client, local::Request request, std::uint64_t serial = 77) {
+    request.set_serial(serial);
+    ASSERT_TRUE(client.put(request));
+  }
+};
+
+TEST_F(LimitedRequestsTest, LeaveRoomForThoseOfOtherUsers) {
+  std::size_t waiting = 0;
+  for (bool is_full = false; !is_full;) {
+    const auto program = connect(kUser);  // which does not wait for the answers
+    for (std::size_t i = 0; i < LocalService::kMaxAwaited && !is_full; ++i) {
+      put(*program, list_request());
+      is_full = !program->received.empty();
+      if (!is_full) ++waiting;
+    }
+    EXPECT_EQ(is_full ? program->next().failure().code() : "limit_exceeded", "limit_exceeded");
+    ASSERT_LE(waiting, LocalService::kMaxAwaitedPerUser);
+  }
+  EXPECT_EQ(waiting, LocalService::kMaxAwaitedPerUser);
+  const auto other = connect(kUser + 1), root = connect(0), same = connect(kUser);
+  put(*other, list_request());
+  put(*root, list_request());
+  EXPECT_TRUE(other->received.empty()) << "it waits for an answer";
+  EXPECT_TRUE(root->received.empty());
+  fleet.list_then.at(0)(std::vector<proto::Stream>());
+  put(*same, list_request());
+  EXPECT_TRUE(same->received.empty()) << "there is room again";
+}
+
+TEST_F(LimitedRequestsTest, BoundTheirBytes) {
+  const auto program = connect(kUser), other = connect(kUser + 1);
+  local::Request property;
+  property.mutable_set_property()->mutable_id()->set_host("pc2");
+  property.mutable_set_property()->mutable_id()->set_name("lidar");
+  property.mutable_set_property()->set_property(std::string(wire::kMaxPropertyBytes, 'x'));
+  fleet.answers_properties = false;
+  put(*program, property);
+  EXPECT_TRUE(program->received.empty()) << "the largest property is possible";
+  put(*program, property);
+  EXPECT_EQ(program->next().failure().code(), "limit_exceeded");
+  put(*other, property);
+  EXPECT_TRUE(other->received.empty());
 }
 
 // There was no memory to send it.
