@@ -299,7 +299,9 @@ void Recorder::Opener::run() {
     if (!is_wanted) continue;
     entry->is_opening = false;
     const Error& error = opened.error();
-    const bool is_to_retry = is_retryable(error.code);
+    // One that was recorded may be read again after the next reload of dssmd's configuration.
+    const bool is_to_retry = is_retryable(error.code) ||
+                             (wanted.replaced_incarnation && error.code == Errc::no_permission);
     if (!wanted.reported) {
       notices_.push_back(fmt::format("'{}' is not recorded{}: {}", escaped(wanted.stream.id.str()),
                                      is_to_retry ? " yet" : "", escaped_message(error.message)));
@@ -404,6 +406,7 @@ Result<std::unique_ptr<Recorder>> Recorder::start(Session session,
 Result<void> Recorder::begin(RecordingWriter file, Duration before) {
   file_ = std::move(file);
   is_recording_ = true;
+  newest_tids_.clear();
   newest_time_ = Time::min();
   wanted_from_ = WallClock::now();
   before_ = before;
@@ -507,6 +510,12 @@ Result<void> Recorder::add_to_file(Source& source) {
       opener_.described(reader.id(), reader.incarnation()).value_or(reader.type());
   source.number = DSSM_TRY(file_->add_stream(
       {reader.id(), type, reader.depth(), reader.cycle(), reader.incarnation(), source.property}));
+  if (source.number == newest_tids_.size()) newest_tids_.push_back(kNoTid);
+  // It was recorded before, and could not be read for a while.
+  if (const Tid newest = newest_tids_[source.number]; newest > source.reader.cursor()) {
+    source.reader.seek(newest);
+    source.next = newest + 1;
+  }
   return {};
 }
 
@@ -726,6 +735,7 @@ Result<void> Recorder::write(Source& source, const SampleInfo& info) {
                             static_cast<std::uint64_t>(info.tid - source.next)));
   }
   source.next = info.tid + 1;
+  newest_tids_[source.number] = info.tid;
   newest_time_ = std::max(newest_time_, info.time);
   return file_->write(source.number, info, source.reader.clock_error(info),
                       std::span(payload_).first(info.payload_bytes));

@@ -288,8 +288,9 @@ class Recorder {
   const Duration keep_removed_;
   bool is_recording_;  // in file_, which is not finished
   std::optional<RecordingWriter> file_;
-  Time wanted_from_{};  // on demand: of the file's samples
-  Duration before_{};   // the same, before begin()
+  std::vector<Tid> newest_tids_;  // that file_ has, by the streams' numbers
+  Time wanted_from_{};            // on demand: of the file's samples
+  Duration before_{};             // the same, before begin()
   Opener opener_;
   std::vector<Source> sources_;
   std::vector<Turn> turns_;  // in take_in_order(), the earliest next one first

@@ -3,8 +3,15 @@
 // What dssmctl record does while it reads no ring: here the test decides when it reads.
 #include "client/dssmctl/recorder.hpp"
 
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include <csignal>
 #include <dssm/recording.hpp>
+#include <filesystem>
+#include <fstream>
 #include <optional>
+#include <thread>
 
 #include "tests/process/dssmctl/ctl_test.hpp"
 #include "tests/support/folder.hpp"
@@ -174,6 +181,61 @@ TEST_F(RecorderOf, AStreamHasItsDescriptionFromTheNextFileOn) {
   ASSERT_EQ(recording.streams().size(), 1U);
   EXPECT_EQ(recording.streams()[0].type, type_of<RecordedVolts>());
   EXPECT_EQ(recording.streams()[0].samples, static_cast<std::uint64_t>(written));
+}
+
+TEST(RecorderOfAnyUser, GoesOnWhereItWasWhenItMayReadAgain) {
+  if (::geteuid() != 0) GTEST_SKIP() << "only root can become somebody else";
+  const TestFolder folder;
+  const std::string configuration = folder.file("dssmd.conf"), file = folder.file("a.mcap"),
+                    refused = folder.file("refused");
+  ASSERT_EQ(::chmod(folder.path().c_str(), 0777), 0);
+  const auto allow = [&](const std::string& verb) {
+    std::ofstream(configuration) << "rights = [\"local " << verb << " *\"]\n";
+  };
+  allow("read");
+  const DaemonProcess daemon({"--config", configuration, "--listen", "", "--socket-mode", "0666"});
+  ASSERT_EQ(::chmod(daemon.runtime_dir().c_str(), 0755), 0);
+  constexpr int kSamples = 25;
+  const pid_t child = ::fork();
+  if (child == 0) {
+    become_nobody({});
+    const auto recorder =
+        ctl::Recorder::start(session_with(daemon), RecordingWriter::create(file, {}).value(),
+                             {ctl::StreamFilter({}, {}), {}, {}, {}, false})
+            .value();
+    while (recorder->progress().samples < kSamples) {
+      if (const Result<void> taken = recorder->take(); !taken) {
+        std::fprintf(stderr, "%s\n", taken.error().message.c_str());
+        ::_exit(1);
+      }
+      for (const std::string& notice : recorder->take_notices()) {
+        if (contains(notice, "is not recorded yet: ")) std::ofstream(refused) << notice;
+      }
+      std::this_thread::sleep_until(recorder->next_take());
+    }
+    ::_exit(recorder->finish() ? 0 : 1);
+  }
+  Session root = session_with(daemon);
+  Writer<double> writer = root.create<double>("lidar", {64, Duration(1)}).value();
+  int written = 0;
+  const auto write_when = [&](std::uint32_t readers, int samples) {
+    await([&] { return root.stream_info({"lidar", 0, ""}).value().readers == readers; });
+    for (int i = 0; i < samples; ++i) writer.write(written++);
+  };
+  write_when(1, 10);
+  allow("write");
+  ::kill(daemon.pid(), SIGHUP);
+  write_when(0, 5);
+  await([&] { return std::filesystem::exists(refused); });
+  allow("read");
+  ::kill(daemon.pid(), SIGHUP);
+  write_when(1, 10);
+  ASSERT_EQ(written, kSamples);
+  EXPECT_EQ(wait_for(child), 0);
+  const Recording recording = Recording::open(file).value();
+  ASSERT_EQ(recording.streams().size(), 1U);
+  EXPECT_EQ(recording.streams()[0].samples, std::uint64_t{kSamples});
+  EXPECT_EQ(recording.streams()[0].lost_samples, 0U);
 }
 
 }  // namespace
