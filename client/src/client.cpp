@@ -5,7 +5,6 @@
 #include <sys/eventfd.h>
 #include <unistd.h>
 
-#include <algorithm>
 #include <cstdio>
 #include <cstdlib>
 
@@ -223,9 +222,9 @@ Result<std::shared_ptr<OpenStream>> Client::open_reader(const StreamId& id, std:
   return open(std::move(request), Role::reader, tag);
 }
 
-void Client::want_history(const OpenStream& stream, Tid from) noexcept {
+void Client::want_history(const OpenStream& stream) noexcept {
   if (::getpid() != owner_pid_) return;
-  stream.wish = stream.wish_is_new ? std::min(stream.wish.load(), from) : from;
+  stream.wishes = true;
   stream.wish_is_new = true;
   const std::uint64_t one = 1;
   [[maybe_unused]] const ssize_t written = ::write(wish_fd_.get(), &one, sizeof one);

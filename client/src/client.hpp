@@ -43,7 +43,7 @@ class Client : public std::enable_shared_from_this<Client> {
                                                   FetchHistory history);
   // A program reads what is missing in the stream's mirror: the thread tells dssmd. Takes no lock
   // and does not wait, so that a signal handler may read.
-  void want_history(const OpenStream& stream, Tid from) noexcept;
+  void want_history(const OpenStream& stream) noexcept;
   Result<std::shared_ptr<OpenStream>> open_writer(const StreamId& id, std::uint32_t tag);
 
   Result<std::shared_ptr<clock::PlaybackRecord>> open_playback_clock();

@@ -194,11 +194,9 @@ void OpenStreams::post_wishes(bool all) {
     const std::lock_guard guard(mutex_);
     for (const auto& [key, stream] : streams_) {
       const bool is_new = stream->wish_is_new.exchange(false);
-      const Tid from = stream->wish;
-      if (!is_new && !(all && from != kNoTid)) continue;
+      if (!is_new && !(all && stream->wishes)) continue;
       local::Request& request = requests.emplace_back();
       wire::to_message(stream->id, *request.mutable_want_history()->mutable_id());
-      request.mutable_want_history()->set_from_tid(from);
     }
   }
   for (local::Request& request : requests) connection_.post(std::move(request));

@@ -81,10 +81,8 @@ struct OpenStream {
   const std::shared_ptr<const SharedRing> ring;
   // Set once, by supersede(). Shared with the reader's ReadyFd.
   const std::shared_ptr<std::atomic<bool>> superseded = std::make_shared<std::atomic<bool>>(false);
-  // The program has read what is missing in the mirror, from this sample on; kNoTid: it has not.
-  // And whether dssmd has not been notified of that.
-  mutable std::atomic<Tid> wish = kNoTid;
-  mutable std::atomic<bool> wish_is_new = false;
+  // Whether the program has read what is missing in the mirror; and since dssmd was told last.
+  mutable std::atomic<bool> wishes = false, wish_is_new = false;
 
  private:
   friend class OpenStreams;

@@ -74,10 +74,10 @@ template <class Attempt>
   return ReadStatus::lapped;
 }
 
-// What a read of sample `tid` returns to the program; 0: by time.
-[[gnu::always_inline]] inline ReadStatus result(detail::ReaderState& state, ReadStatus status,
-                                                Tid tid = 0) noexcept {
-  if (status == ReadStatus::arriving) state.want_history(tid);
+// What a read returns to the program.
+[[gnu::always_inline]] inline ReadStatus result(detail::ReaderState& state,
+                                                ReadStatus status) noexcept {
+  if (status == ReadStatus::arriving) state.want_history();
   return status;
 }
 
@@ -180,15 +180,12 @@ bool ReaderState::restart() noexcept {
   return !same_samples;
 }
 
-[[gnu::cold]] void ReaderState::want_history(Tid from) noexcept {
+[[gnu::cold]] void ReaderState::want_history() noexcept {
   const MonoTime now = MonoClock::now();
-  const bool is_soon = to_ns(now.time_since_epoch()) < next_wish_ns;
-  if (is_soon && from >= last_wish) return;
-  if (is_soon) from = 0;
+  if (to_ns(now.time_since_epoch()) < next_wish_ns) return;
   next_wish_ns = to_ns((now + kHistoryPause).time_since_epoch());
-  last_wish = from;
   const std::shared_ptr<OpenStream> on = stream_now();
-  on->client->want_history(*on, from);
+  on->client->want_history(*on);
 }
 
 std::shared_ptr<OpenStream> ReaderState::stream_now() const {
@@ -223,7 +220,7 @@ ReadStatus RawReader::read_tid(Tid tid, std::span<std::byte> payload, SampleInfo
   DSSM_CHECK(payload.size() == payload_bytes());
   const ReadStatus status = state_->ring.read(tid, payload, info);
   if (status == ReadStatus::ok) state_->set_cursor(tid);
-  return result(*state_, status, tid);
+  return result(*state_, status);
 }
 
 [[gnu::hot]] ReadStatus RawReader::read_next(std::span<std::byte> payload,
@@ -236,7 +233,7 @@ ReadStatus RawReader::read_tid(Tid tid, std::span<std::byte> payload, SampleInfo
     const bool is_arriving = status == ReadStatus::arriving;
     if (is_arriving) {
       state_->awaited = wanted;
-      state_->want_history(wanted);
+      state_->want_history();
       status = ReadStatus::not_yet;
     }
     if (status == ReadStatus::not_yet) {
@@ -395,7 +392,7 @@ Tid RawReader::newest_tid() const noexcept { return state_->ring.newest(); }
 Tid RawReader::oldest_tid() const noexcept { return state_->ring.oldest(); }
 
 ReadStatus RawReader::read_info(Tid tid, SampleInfo& info) const noexcept {
-  return result(*state_, state_->ring.stamp(tid, info), tid);
+  return result(*state_, state_->ring.stamp(tid, info));
 }
 
 ReadStatus RawReader::find(Time t, SampleInfo& info) const noexcept {
@@ -423,7 +420,7 @@ ReadStatus RawReader::borrow(Tid tid, BorrowedSample& out) noexcept {
   if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
   ring::RingReader::Place place{};
   const ReadStatus status = state_->ring.locate(tid, place, out.info_);
-  if (status != ReadStatus::ok) return result(*state_, status, tid);
+  if (status != ReadStatus::ok) return result(*state_, status);
   out.payload_ = {place.payload, out.info_.payload_bytes};
   out.sequence_ = place.sequence;
   state_->set_cursor(tid);
@@ -449,7 +446,7 @@ WaitStatus RawReader::wait_for_sample(Tid tid, MonoTime deadline) noexcept {
   const ring::RingReader ring(*stream->ring->mapping);
   return wait_until(*stream->ring, deadline, [&] {
     if (ring.is_settled(tid)) return true;
-    if (tid <= ring.newest()) state_->want_history(tid);
+    if (tid <= ring.newest()) state_->want_history();
     return state_->restart_wakes(*stream);
   });
 }

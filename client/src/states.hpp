@@ -51,10 +51,9 @@ struct ReaderState {
   // Whether a wait on `on` must end so that the reader can try to restart.
   bool restart_wakes(const OpenStream& on) const noexcept;
 
-  // What is read is still to come: dssmd shall fetch what is missing, from sample `from` on. To be
-  // repeated while that is so: the connection to its host, and dssmd, may begin anew meanwhile. A
-  // program that goes back soon gets all of it.
-  void want_history(Tid from) noexcept;
+  // What is read is still to come: dssmd shall fetch what is missing. To be repeated while that is
+  // so: the connection to its host, and dssmd, may begin anew meanwhile.
+  void want_history() noexcept;
 
   // read_next() continues after `tid`.
   void set_cursor(Tid tid) noexcept {
@@ -67,7 +66,7 @@ struct ReaderState {
   bool has_news(const ring::RingReader& from) noexcept {
     if (awaited == kNoTid) return from.newest() > cursor;
     if (from.is_settled(awaited)) return true;
-    want_history(awaited);
+    want_history();
     return false;
   }
 
@@ -83,8 +82,7 @@ struct ReaderState {
   std::uint64_t restarts = 0;
   std::optional<Error> restart_error;
   std::atomic<std::int64_t> next_attempt_ns = 0;  // monotonic: restart() sends no request before
-  std::atomic<std::int64_t> next_wish_ns = 0;     // monotonic: nor does want_history(),
-  std::atomic<Tid> last_wish = 0;                 // for the same samples
+  std::atomic<std::int64_t> next_wish_ns = 0;     // monotonic: nor does want_history()
   std::shared_ptr<ReadyFd> ready;
 };
 

@@ -321,9 +321,7 @@ void SamplePump::pass_over(Tid next, MonoTime now) {
   next_ = next;
   if (has_pace()) limit_unsent(connection_.progress());
   if (passed_over_since_ == 0) {
-    // What was written before the subscription is no overload.
-    const Tid begin = passed_over_.back().begin;
-    behind_from_ = has_kept_up_ ? begin : std::clamp(plan_.caught_up_at + 1, begin, next);
+    behind_from_ = has_kept_up_ ? passed_over_.back().begin : next;  // history is no overload
   }
   give_up_what_is_never_carried(now);
 }
@@ -343,8 +341,9 @@ void SamplePump::leave_out(Tid newest) {
 // the network carries less than is written. Of small ones the older ones count, too, because they
 // go first.
 void SamplePump::give_up_what_is_never_carried(MonoTime now) {
-  auto first = std::find_if(passed_over_.begin(), passed_over_.end(),
-                            [&](const ring::TidRange& range) { return range.end > behind_from_; });
+  const auto first =
+      std::find_if(passed_over_.begin(), passed_over_.end(),
+                   [&](const ring::TidRange& range) { return range.begin >= behind_from_; });
   const Tid counted_from = has_pace() ? behind_from_ : plan_.backlog_from;
   Tid waiting = 0;
   for (const ring::TidRange& range : passed_over_) {
@@ -355,17 +354,12 @@ void SamplePump::give_up_what_is_never_carried(MonoTime now) {
       passed_over_since_ >= kOverloadedSamples && now - behind_since_ >= kOverloadedAfter;
   if (passed_over_since_ == 1 ||
       (is_measured && (waiting <= waiting_before_ || first == passed_over_.end() ||
-                       is_spared(std::max(first->begin, behind_from_), now)))) {
+                       is_spared(first->begin, now)))) {
     passed_over_since_ = 1;
     behind_since_ = now;
     waiting_before_ = waiting;
     next_before_ = next_;
   } else if (is_measured) {
-    if (first->begin < behind_from_) {
-      lose({behind_from_, first->end});
-      first->end = behind_from_;
-      ++first;
-    }
     for (auto range = first; range != passed_over_.end(); ++range) lose(*range);
     passed_over_.erase(first, passed_over_.end());
     waiting_before_ = 0;

@@ -220,7 +220,7 @@ void FleetService::open_reader(const StreamId& id, bool history, const std::stri
     const StreamId named = owned_by(**owner, id);
     const auto want = [&] {
       Mirror* mirror = history ? mirrors_.find(named) : nullptr;
-      if (mirror) mirror->want_history(0, true);
+      if (mirror) mirror->want_history(true);
     };
     want();  // so that open() waits for it
     mirrors_.open(
@@ -233,14 +233,14 @@ void FleetService::open_reader(const StreamId& id, bool history, const std::stri
     return want();  // of a new mirror, which is not connected yet
   }
   if (Mirror* mirror = mirror_without_owner(id)) {
-    if (history) mirror->want_history(0, true);
+    if (history) mirror->want_history(true);
     if (std::shared_ptr<Stream> stream = mirror->acquire()) return then(std::move(stream));
   }
   then(with_unavailable_peers(owner.error()));
 }
 
-void FleetService::want_history(const StreamId& id, Tid from, bool always) {
-  if (Mirror* mirror = mirrors_.find(id)) mirror->want_history(from, always);
+void FleetService::want_history(const StreamId& id, bool always) {
+  if (Mirror* mirror = mirrors_.find(id)) mirror->want_history(always);
 }
 
 void FleetService::open_writer(const StreamId& id, const CreatePlan* plan,

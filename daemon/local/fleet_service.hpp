@@ -63,7 +63,7 @@ class FleetService final : public Fleet, private CatalogObserver {
   void when_known(const StreamId& id, std::size_t bytes, std::function<void()> go_on) override;
   void open_reader(const StreamId& id, bool history, const std::string& account,
                    Then<std::shared_ptr<Stream>> then) override;
-  void want_history(const StreamId& id, Tid from, bool always) override;
+  void want_history(const StreamId& id, bool always) override;
   void open_writer(const StreamId& id, const CreatePlan* plan, const std::string& account,
                    Then<OpenedRing> then) override;
   Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role role, OfferedFiles files,

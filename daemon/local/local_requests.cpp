@@ -3,7 +3,6 @@
 
 #include <unistd.h>
 
-#include <algorithm>
 #include <utility>
 
 #include "core/base/try.hpp"
@@ -112,8 +111,7 @@ Result<Reply> LocalRequests::serve_untrusted(const Client& client, const local::
     }
     case local::Request::kWantHistory: {
       const StreamId id = DSSM_TRY(wire::stream_id_untrusted(request.want_history().id()));
-      const Tid from = std::max<Tid>(request.want_history().from_tid(), 0);
-      if (fleet_) fleet_->want_history(id, from, false);
+      if (fleet_) fleet_->want_history(id, false);
       return done();
     }
     case local::Request::kOpenClock:
@@ -171,7 +169,7 @@ Result<Reply> LocalRequests::offer(const Client& client, const local::Offer& req
   const std::shared_ptr<Stream> stream =
       DSSM_TRY(is_own ? registry_.adopt_untrusted(id, std::move(files))
                       : fleet_->adopt_untrusted(id, role, std::move(files), client->account()));
-  if (!is_own && request.history()) fleet_->want_history(id, 0, true);
+  if (!is_own && request.history()) fleet_->want_history(id, true);
   return record_open({client, stream, role, request.tag(), request.any_host()});
 }
 

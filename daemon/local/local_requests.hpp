@@ -76,10 +76,9 @@ class Fleet {
   //   account  who is charged for a new mirror or remote writer, as Identity::account()
   virtual void open_reader(const StreamId& id, bool history, const std::string& account,
                            Then<std::shared_ptr<Stream>> then) = 0;
-  // A program reads what is missing in the mirror of that stream, from sample `from` on; there may
-  // be none.
-  //   always  or wants all of it at once, now and later
-  virtual void want_history(const StreamId& id, Tid from, bool always) = 0;
+  // A program reads what is missing in the mirror of that stream; there may be none.
+  //   always  or wants it at once, now and later
+  virtual void want_history(const StreamId& id, bool always) = 0;
 
   // A ring of this host that is published into the other host's stream.
   //   plan  create the stream there unless it exists, `id` names the host; nullptr: it must exist,

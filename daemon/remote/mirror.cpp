@@ -57,10 +57,9 @@ Result<void> Mirror::on_opened(StreamInfo theirs, bool) {
 void Mirror::subscribe() {
   // Which samples have a place in a ring that is shorter, only the owner's newest one tells.
   const bool is_known = !is_shorter_ || is_subscribed_;
-  const Tid from = is_known ? wanted_from() : MirrorRing::kNoHistory;
-  with_history_ = from != MirrorRing::kNoHistory;
+  with_history_ = (wants_history() && is_known) || !newest_first_;
   net::Subscribe request;
-  ring_->resume(newest_first_, from, request);
+  ring_->resume(newest_first_, with_history_, request);
   // Here the oldest samples that are missing have no place: the newest of them first.
   if (is_shorter_ && request.has_backlog_from()) request.set_backlog_from(channel::kMaxTid);
   max_rate_hz_ = wanted_rate_hz();
@@ -73,7 +72,7 @@ Result<void> Mirror::on_subscribed_untrusted(Tid first, bool newest_first, Tid o
   is_subscribed_ = true;
   log_new_gap();
   last_error_.reset();
-  if (wanted_from() < ring_->wanted_from() || max_rate_hz_ != wanted_rate_hz()) subscribe();
+  if ((!with_history_ && wants_history()) || max_rate_hz_ != wanted_rate_hz()) subscribe();
   return {};
 }
 
@@ -81,20 +80,14 @@ double Mirror::wanted_rate_hz() const noexcept {
   return newest_first_ ? parts_.mirrors.demand_for(id_).max_rate_hz : 0;
 }
 
-Tid Mirror::wanted_from() const noexcept {
-  const bool is_all = history_always_ || parts_.mirrors.demand_for(id_).history_at_once;
-  return is_all ? 0 : history_from_;
+bool Mirror::wants_history() const noexcept {
+  return history_wanted_ || history_always_ || parts_.mirrors.demand_for(id_).history_at_once;
 }
 
-void Mirror::want_history(Tid from, bool always) {
+void Mirror::want_history(bool always) {
   history_always_ |= always;
-  if (always) from = 0;
-  const bool is_answered = channel_.reading() >= ChannelClient::Reading::filling;
-  if ((is_answered ? ring_->wanted_from() : wanted_from()) <= from) return;  // it comes
-  // A program that goes back would ask for one sample after the other.
-  const bool is_second = history_from_ != MirrorRing::kNoHistory || (is_answered && with_history_);
-  history_from_ = is_second ? 0 : from;
-  if (is_answered) subscribe();
+  history_wanted_ = true;
+  if (!with_history_ && channel_.reading() >= ChannelClient::Reading::filling) subscribe();
 }
 
 std::string_view Mirror::gap_reason() const noexcept {
@@ -112,13 +105,13 @@ std::uint64_t Mirror::depth_for(const StreamInfo& theirs) const noexcept {
 }
 
 void Mirror::on_new_demand() {
-  if (parts_.mirrors.demand_for(id_).history_at_once) want_history(0, false);
+  if (parts_.mirrors.demand_for(id_).history_at_once) want_history(false);
   const bool is_answered = channel_.reading() >= ChannelClient::Reading::filling;
   if (is_answered && max_rate_hz_ != wanted_rate_hz()) subscribe();
 }
 
 Result<void> Mirror::on_caught_up() {
-  if (ring_->wanted_from() <= history_from_) history_from_ = MirrorRing::kNoHistory;
+  if (with_history_) history_wanted_ = false;
   ring_->wake();
   if (clear_error()) {
     parts_.logger.notice(
@@ -300,7 +293,6 @@ void Mirror::replace_ring(std::unique_ptr<MirrorRing> ring) {
         fmt::format("stream '{}' has a new ring on its host: it was recreated", name_),
         log_fields());
     clock_.on_new_ring();
-    if (history_from_ != MirrorRing::kNoHistory) history_from_ = 0;  // a tid of the old ring
   }
   ring_ = std::move(ring);
   logged_gap_ = 0;
@@ -356,7 +348,7 @@ void Mirror::describe(proto::Mirror& out) const {
   out.set_depth(ring_->stream()->mapping().geometry().depth);
   out.set_newest_time_ns(to_ns(ring_->newest_time()));
   out.set_filling_samples(ring_->filling_samples());
-  out.set_history_wanted(wanted_from() == 0 || ring_->wanted_from() == 0);
+  out.set_history_wanted(with_history_ || wants_history());
   const MirrorRing::Recent recent = ring_->recent();
   out.set_recent_samples(recent.samples);
   out.set_recent_lost_samples(recent.lost);

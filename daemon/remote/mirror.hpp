@@ -42,10 +42,9 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
 
   Mirror(const ChannelParts& parts, StreamId id, RingQuota quota, std::function<void()> on_done);
 
-  // Fetches what is missing in the ring from sample `from` on, also after a reconnect, until that
-  // has come once. All of it when a part that was asked for in this way turns out to be too small.
-  //   always  and from then on all of it, at once
-  void want_history(Tid from, bool always);
+  // Fetches what is missing in the ring, also after a reconnect, until that has come once.
+  //   always  and from then on at once
+  void want_history(bool always);
   // ChannelParts::mirrors has changed.
   void on_new_demand();
 
@@ -102,16 +101,15 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
   }
   std::string_view gap_reason() const noexcept;
   std::uint64_t depth_for(const StreamInfo& theirs) const noexcept;
-  Tid wanted_from() const noexcept;
+  bool wants_history() const noexcept;
   double wanted_rate_hz() const noexcept;
   void subscribe();
   bool is_filling() const noexcept;
   proto::Mirror::State shown_state() const noexcept;
 
-  bool newest_first_ = false;                  // the owner has that feature
-  bool is_fresh_ = false;                      // a sample has come on this connection
-  Tid history_from_ = MirrorRing::kNoHistory;  // wanted, and has not come; >= 0
-  bool history_always_ = false;
+  bool newest_first_ = false;  // the owner has that feature
+  bool is_fresh_ = false;      // a sample has come on this connection
+  bool history_wanted_ = false, history_always_ = false;
   bool with_history_ = false;   // the present subscription, and
   double max_rate_hz_ = 0;      // its rate; 0: all samples
   bool is_shorter_ = false;     // the ring, than the owner's

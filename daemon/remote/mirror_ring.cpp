@@ -58,30 +58,25 @@ void MirrorRing::end_filling() noexcept {
   wake();
 }
 
-void MirrorRing::resume(bool newest_first, Tid history_from, net::Subscribe& out) {
-  if (!newest_first) {
-    end_filling();
-    history_from = 0;
-  }
-  const bool has_history = history_from != kNoHistory;
+void MirrorRing::resume(bool newest_first, bool with_history, net::Subscribe& out) {
+  if (!newest_first) end_filling();
+  with_history_ = with_history || !newest_first;
   lost_ahead_.clear();  // they will be sent, or reported again
   if (slots_.newest() < 0 && cursor_.next() != kNoTid) cursor_.set_next(begins_at_);
   cursor_.resume(stream_->incarnation(), out);
   out.set_newest_first(newest_first);
   const ring::TidRange hole = reader_.hole();
   const bool has_hole = !hole.is_empty() && hole.end > reader_.oldest();
-  asks_for_all_ = has_history && (!has_hole || history_from <= first_missing(0));
-  asked_from_ = asks_for_all_ ? 0 : history_from;
   if (newest_first && slots_.newest() >= 0) {
     out.set_backlog_from(has_hole ? first_missing(backlog_from_) : backlog_from_);
   }
-  if (!has_history) {
+  if (!with_history_) {
     out.set_from_newest(true);
   } else if (has_hole) {
-    out.set_from_tid(first_missing(asked_from_));
+    out.set_from_tid(first_missing(0));
   }
   if (out.has_from_tid()) out.set_from_tid(std::max<Tid>(out.from_tid(), has_place_from_));
-  if (!has_hole && has_history) return;
+  if (!has_hole && with_history_) return;
   if (slots_.newest() < 0) return;
   out.set_incarnation(stream_->incarnation());
   out.set_held_from(has_hole ? hole.end : reader_.oldest());
@@ -92,13 +87,12 @@ Result<void> MirrorRing::on_subscribed_untrusted(Tid first, bool newest_first, T
   newest_first_ = newest_first;
   cursor_.set_thinned(newest_first);  // what is passed over comes later
   const Tid next = cursor_.next();
-  const bool is_whole = asks_for_all_ || !newest_first;
-  const bool from_newest = !is_whole && asked_from_ == kNoHistory;
+  const bool is_whole = with_history_ || !newest_first;
   // What has no place in a ring that is shorter than the owner's is not awaited.
-  if (from_newest) has_place_from_ = oldest_beside(std::clamp<Tid>(first, 0, channel::kMaxTid));
+  if (!is_whole) has_place_from_ = oldest_beside(std::clamp<Tid>(first, 0, channel::kMaxTid));
   const Tid held = std::max(oldest, has_place_from_);
   const Tid begin = is_whole ? first : std::clamp<Tid>(held, 0, std::max<Tid>(first, 0));
-  wanted_from_ = is_whole ? 0 : from_newest ? first : asked_from_;
+  wanted_from_ = is_whole ? 0 : first;
   if (!newest_first || next == kNoTid || slots_.newest() < 0) {
     if (newest_first) cursor_.set_next(kNoTid);
     DSSM_TRY(cursor_.on_subscribed_untrusted(first));

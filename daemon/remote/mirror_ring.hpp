@@ -48,14 +48,9 @@ class MirrorRing {
   // it that are here, and for those that follow on the newest one; for all, if the owner never sent
   // where this ring begins. The newest first.
   //   newest_first  the owner has that feature; else what is missing in the hole will never come
-  //   history_from  not for what is missing before that sample; kNoHistory: only for the newest one
-  //                 and those that follow. What is not asked for is in the hole until resume() asks
-  //                 for it. Without newest_first, or while the ring is empty, all or nothing
-  void resume(bool newest_first, Tid history_from, net::Subscribe& out);
-  static constexpr Tid kNoHistory = channel::kMaxTid + 1;
-  // By the subscription that was answered last, the owner sends all that is missing from this
-  // sample on, or reports it as lost.
-  Tid wanted_from() const noexcept { return wanted_from_; }
+  //   with_history  false: only for the newest sample and those that follow. Those before are in
+  //                 the hole until resume() asks for them. Without newest_first always true
+  void resume(bool newest_first, bool with_history, net::Subscribe& out);
   // The owner will not send what is missing in the hole: it counts as lost.
   void end_filling() noexcept;
 
@@ -120,8 +115,7 @@ class MirrorRing {
   ring::RingReader reader_;
   channel::SampleCursor cursor_;
   bool newest_first_ = false;  // the owner sends so
-  Tid asked_from_ = 0;         // history_from of the present request,
-  bool asks_for_all_ = true;   // which is for all that is missing
+  bool with_history_ = true;   // the present request
   Tid wanted_from_ = 0;        // earlier ones do not count as lost: not asked for
   Tid has_place_from_ = 0;     // beside the newest one that the owner named last
   Tid begins_at_ = 0;          // an empty ring: earlier ones were never asked for

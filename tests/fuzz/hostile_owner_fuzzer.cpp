@@ -130,7 +130,7 @@ class Programs {
       case 5:
         return add(what / 8);
       case 6:
-        return want_history(what / 16, what & 8);
+        return want_history(what & 8);
       default:
         host_.catalog.host_down(owner_.host().greeting.host_id, {Errc::unavailable, "a test"});
         host_.catalog.host_up(owner_.host().greeting, owner_.host().address);
@@ -154,9 +154,9 @@ class Programs {
     static_cast<void>(
         host_.catalog.stream_added(owner_.host().greeting.host_id, std::move(stream)));
   }
-  void want_history(Tid from, bool always) {
+  void want_history(bool always) {
     if constexpr (std::is_same_v<Kind, Mirror>) {
-      if (Mirror* mirror = streams_.find(kStream)) mirror->want_history(from, always);
+      if (Mirror* mirror = streams_.find(kStream)) mirror->want_history(always);
     }
   }
   void use_rings() {

@@ -28,7 +28,7 @@ class LateFleet final : public Fleet {
                    Then<std::shared_ptr<Stream>> then) override {
     due_.push_back([this, id, then = std::move(then)] { then(ring(id)); });
   }
-  void want_history(const StreamId&, Tid, bool) override {}
+  void want_history(const StreamId&, bool) override {}
   void open_writer(const StreamId& id, const CreatePlan* plan, const std::string&,
                    Then<OpenedRing> then) override {
     if (plan) replace(id);

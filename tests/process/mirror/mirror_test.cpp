@@ -150,38 +150,6 @@ TEST_F(TwoHosts, FetchTheHistoryForAnInOrderReaderThatSleeps) {
   EXPECT_EQ(reader.lost_samples(), 0u);
 }
 
-TEST_F(TwoHosts, FetchNoMoreAfterACutThanAnInOrderReaderMissed) {
-  auto writer = here.create<Numbered>("odometry", History{1024, 1ms}).value();
-  const auto write_to = [&](Tid last) {
-    for (Tid tid = writer.newest_tid() + 1; tid <= last; ++tid) {
-      writer.write(numbered(tid), time_from_ns(1000 * tid), Duration(1));
-    }
-  };
-  write_to(99);
-  auto reader = there.await_reader<Numbered>("odometry", kNever).value();
-  Numbered sample{};
-  SampleInfo info;
-  ASSERT_EQ(reader.read_newest(sample, info), ReadStatus::ok);
-  pc1.kill_hard();
-  write_to(109);
-  pc1.start();
-  for (Tid tid = 100; tid < 110;) {
-    const ReadStatus status = reader.read_next(sample, info);
-    if (status == ReadStatus::not_yet) {
-      ASSERT_EQ(reader.wait(kNever), WaitStatus::ready);
-      continue;
-    }
-    ASSERT_EQ(status, ReadStatus::ok);
-    ASSERT_EQ(info.tid, tid++);
-  }
-  await([&] { return mirror("odometry").state == MirrorState::live; });
-  EXPECT_EQ(mirror("odometry").received_samples, 11u) << "no program reads the others";
-  // One that goes back needs all of them.
-  EXPECT_EQ(reader.read_tid(98, sample, info), ReadStatus::arriving);
-  await([&] { return mirror("odometry").filling_samples == 0; });
-  EXPECT_EQ(mirror("odometry").received_samples, 110u) << "each once";
-}
-
 TEST_F(TwoHosts, HaveTheHistoryAtOnceForAReaderThatAsksForIt) {
   auto writer = here.create<Numbered>("odometry", History{1024, 1ms}).value();
   for (int i = 0; i < 100; ++i) writer.write(numbered(i), time_from_ns(1000 * i), Duration(i));

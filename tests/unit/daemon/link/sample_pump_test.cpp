@@ -685,24 +685,6 @@ TEST_F(Overloaded, WhatTheNetworkNeverCarriesIsLostAtOnce) {
   EXPECT_EQ(rig.gaps, (std::map<Tid, Tid>{{2, 2}, {5, 2}, {8, 2}, {11, 2}, {14, 2}}));
 }
 
-// As of a subscription from the newest sample on: what follows is no history.
-TEST_F(Overloaded, FromItsBeginOnIsNoReasonToKeepWhatIsNeverCarried) {
-  start({2, 1, 0});
-  for (int i = 1; i < 5; ++i) round(i);
-  EXPECT_EQ(rig.pump->lost(), 8u) << "2 and 3, too";
-}
-
-TEST_F(Overloaded, FromItsBeginOnKeepsHistory) {
-  start({0, 1, 0});
-  for (int i = 1; i < 5; ++i) round(i);
-  EXPECT_EQ(rig.pump->lost(), 8u) << "but neither 0 nor 1";
-  rig.peer.room = MemoryPeer::kAll;
-  EXPECT_EQ(rig.run_on(), PumpWait::sample);
-  const std::vector<Tid> accepted = rig.accepted();
-  EXPECT_EQ(accepted.back(), 0);
-  EXPECT_EQ(rig.caught_up, 2) << "both subscriptions";
-}
-
 class OverloadedWithALongHistory : public Overloaded {
  protected:
   OverloadedWithALongHistory() : Overloaded(64) {}

@@ -37,9 +37,8 @@ class FakeFleet final : public Fleet {
     asked.push_back("open_reader " + id.str() + (history ? " with history" : ""));
     reader_then = std::move(then);
   }
-  void want_history(const StreamId& id, Tid from, bool always) override {
-    asked.push_back("want_history " + id.str() + " from " + std::to_string(from) +
-                    (always ? " always" : ""));
+  void want_history(const StreamId& id, bool always) override {
+    asked.push_back("want_history " + id.str() + (always ? " always" : ""));
   }
   void open_writer(const StreamId& id, const CreatePlan* plan, const std::string&,
                    Then<OpenedRing> then) override {
@@ -195,13 +194,9 @@ TEST_F(RemoteRequestsTest, PassesOnThatHistoryIsWanted) {
   local::Request want;
   want.mutable_want_history()->mutable_id()->set_name("lidar");
   want.mutable_want_history()->mutable_id()->set_host("pc2");
-  for (const Tid from : {0, 42, -42}) {
-    want.mutable_want_history()->set_from_tid(from);
-    EXPECT_TRUE(client->ask(want).has_done());
-  }
+  EXPECT_TRUE(client->ask(want).has_done());
   EXPECT_EQ(fleet.asked,
-            (Asked{"open_reader lidar:0@pc2 with history", "want_history lidar:0@pc2 from 0",
-                   "want_history lidar:0@pc2 from 42", "want_history lidar:0@pc2 from 0"}));
+            (Asked{"open_reader lidar:0@pc2 with history", "want_history lidar:0@pc2"}));
 }
 
 TEST_F(RemoteRequestsTest, PrefersAnOwnStreamAndOpensOthersRemotely) {
@@ -646,8 +641,7 @@ TEST_F(RecoveringRequestsTest, GiveBackWhatBelongsToAnotherHost) {
   const local::Response answer = client->ask(offer);
   EXPECT_TRUE(answer.has_opened()) << answer.failure().message();
   EXPECT_TRUE(client->last_descriptors.empty());
-  EXPECT_EQ(fleet.asked,
-            (Asked{"adopt reader lidar:0@pc2", "want_history lidar:0@pc2 from 0 always"}));
+  EXPECT_EQ(fleet.asked, (Asked{"adopt reader lidar:0@pc2", "want_history lidar:0@pc2 always"}));
   ASSERT_EQ(opens.entries().size(), 1u);
   EXPECT_TRUE(opens.entries().begin()->second.any_host) << "as it was opened";
   EXPECT_TRUE(registry.streams().empty()) << "it is none of ours";

@@ -49,7 +49,7 @@ class MirrorRingTest : public testing::Test {
   // The sample that it asks the owner for; kNoTid: the oldest.
   Tid wanted() const {
     net::Subscribe request;
-    ring->resume(true, 0, request);
+    ring->resume(true, true, request);
     return request.from_oldest() ? kNoTid : request.from_tid();
   }
   ReadStatus read(Tid tid) {
@@ -201,10 +201,9 @@ TEST_F(MirrorRingTest, WakesSleepersOncePerBatch) {
 
 class NewestFirstTest : public MirrorRingTest {
  protected:
-  static constexpr Tid kNoHistory = MirrorRing::kNoHistory;
-  net::Subscribe request(Tid history_from = 0) const {
+  net::Subscribe request(bool with_history = true) const {
     net::Subscribe request;
-    ring->resume(true, history_from, request);
+    ring->resume(true, with_history, request);
     return request;
   }
   ReadStatus find(std::int64_t ns) const {
@@ -287,7 +286,7 @@ TEST_F(NewestFirstTest, AsksForTheHoleAfterACutAndAfterADssmdThatDied) {
 }
 
 TEST_F(NewestFirstTest, HistoryComesWhenItIsWanted) {
-  EXPECT_TRUE(request(kNoHistory).from_newest());
+  EXPECT_TRUE(request(false).from_newest());
   ASSERT_TRUE(ring->on_subscribed_untrusted(9, true, 2));
   for (const Tid tid : {9, 10}) ASSERT_TRUE(take(tid));
   ring->wake();
@@ -296,9 +295,9 @@ TEST_F(NewestFirstTest, HistoryComesWhenItIsWanted) {
   EXPECT_EQ(read(8), ReadStatus::arriving);
   EXPECT_EQ(find(1008), ReadStatus::arriving);
   // After a cut the newest one comes first again, and what was missed is history, too.
-  EXPECT_TRUE(request(kNoHistory).from_newest());
-  EXPECT_EQ(request(kNoHistory).held_from(), 9);
-  EXPECT_EQ(request(kNoHistory).held_to(), 11);
+  EXPECT_TRUE(request(false).from_newest());
+  EXPECT_EQ(request(false).held_from(), 9);
+  EXPECT_EQ(request(false).held_to(), 11);
   ASSERT_TRUE(ring->on_subscribed_untrusted(13, true, 4));
   ASSERT_TRUE(take(13));
   EXPECT_EQ(read(12), ReadStatus::arriving);
@@ -314,40 +313,8 @@ TEST_F(NewestFirstTest, HistoryComesWhenItIsWanted) {
   EXPECT_EQ(ring->gap_samples(), 0u) << "nobody wanted those that are lost";
 }
 
-TEST_F(NewestFirstTest, APartOfTheHistoryComesWhenNoMoreIsWanted) {
-  request(kNoHistory);
-  ASSERT_TRUE(ring->on_subscribed_untrusted(5, true, 0));
-  for (const Tid tid : {5, 6}) ASSERT_TRUE(take(tid));
-  // After a cut. Who reads in order needs what was missed, and not what was before it.
-  request(kNoHistory);
-  ASSERT_TRUE(ring->on_subscribed_untrusted(12, true, 1));
-  ASSERT_TRUE(take(12));
-  EXPECT_EQ(ring->wanted_from(), 12);
-  EXPECT_EQ(request(7).from_tid(), 7);
-  EXPECT_EQ(request(7).held_from(), 12);
-  EXPECT_EQ(request(7).held_to(), 13);
-  ASSERT_TRUE(ring->on_subscribed_untrusted(7, true, 1));
-  EXPECT_EQ(ring->wanted_from(), 7);
-  for (const Tid tid : {8, 9, 10, 11}) ASSERT_TRUE(take(tid));
-  EXPECT_EQ(read(7), ReadStatus::arriving);
-  ASSERT_TRUE(ring->on_gap_untrusted(7, 1));
-  ring->wake();
-  EXPECT_EQ(read(7), ReadStatus::lost);
-  EXPECT_EQ(ring->gap_samples(), 1u);
-  EXPECT_EQ(read(4), ReadStatus::arriving) << "it may be wanted later";
-  EXPECT_EQ(read(0), ReadStatus::lost) << "the owner no longer holds it";
-  EXPECT_EQ(find(1004), ReadStatus::arriving);
-  EXPECT_EQ(found(1008), 8);
-  EXPECT_EQ(request(2).from_tid(), 2);
-  ASSERT_TRUE(ring->on_subscribed_untrusted(2, true, 1));
-  EXPECT_EQ(ring->wanted_from(), 2);
-  EXPECT_EQ(request(1).from_tid(), 1);
-  ASSERT_TRUE(ring->on_subscribed_untrusted(1, true, 1));
-  EXPECT_EQ(ring->wanted_from(), 0) << "that is all";
-}
-
 TEST_F(NewestFirstTest, HistoryThatNobodyWantsIsNotMissed) {
-  EXPECT_TRUE(request(kNoHistory).from_newest());
+  EXPECT_TRUE(request(false).from_newest());
   ASSERT_TRUE(ring->on_subscribed_untrusted(9, true, 0));
   for (Tid tid = 9; tid < 60; ++tid) ASSERT_TRUE(take(tid));
   ring->wake();
@@ -359,7 +326,7 @@ TEST_F(NewestFirstTest, HistoryThatNobodyWantsIsNotMissed) {
 }
 
 TEST_F(NewestFirstTest, WhatIsPassedOverAndLostIsMissedAlsoWithoutHistory) {
-  EXPECT_TRUE(request(kNoHistory).from_newest());
+  EXPECT_TRUE(request(false).from_newest());
   ASSERT_TRUE(ring->on_subscribed_untrusted(9, true, 2));
   for (const Tid tid : {9, 12}) ASSERT_TRUE(take(tid));
   ASSERT_TRUE(ring->on_gap_untrusted(10, 2));
@@ -373,7 +340,7 @@ TEST_F(NewestFirstTest, WhatIsPassedOverAndLostIsMissedAlsoWithoutHistory) {
 
 // The owner's ring holds more than this one.
 TEST_F(NewestFirstTest, WhatHasNoPlaceInAShorterRingIsNotAskedFor) {
-  EXPECT_TRUE(request(kNoHistory).from_newest());
+  EXPECT_TRUE(request(false).from_newest());
   ASSERT_TRUE(ring->on_subscribed_untrusted(1000, true, 0));
   EXPECT_EQ(request().from_tid(), 1000 - 14);
   ASSERT_TRUE(take(1000));
@@ -383,7 +350,7 @@ TEST_F(NewestFirstTest, WhatHasNoPlaceInAShorterRingIsNotAskedFor) {
   EXPECT_TRUE(reader.hole().is_empty());
   EXPECT_EQ(ring->gap_samples(), 0u);
   // After a cut.
-  EXPECT_TRUE(request(kNoHistory).from_newest());
+  EXPECT_TRUE(request(false).from_newest());
   ASSERT_TRUE(ring->on_subscribed_untrusted(2000, true, 0));
   EXPECT_EQ(request().from_tid(), 2000 - 14);
   ASSERT_TRUE(take(2000));
@@ -400,7 +367,7 @@ TEST_F(NewestFirstTest, WhatIsPassedOverAndHasNoPlaceAnyMoreIsMissed) {
 }
 
 TEST_F(NewestFirstTest, HistoryMayBeWantedBeforeTheNewestOneHasCome) {
-  EXPECT_TRUE(request(kNoHistory).from_newest());
+  EXPECT_TRUE(request(false).from_newest());
   ASSERT_TRUE(ring->on_subscribed_untrusted(9, true, 2));
   EXPECT_EQ(request().from_tid(), 2);
   ASSERT_TRUE(take(9));  // of the first subscription

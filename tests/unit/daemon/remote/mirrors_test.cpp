@@ -219,7 +219,7 @@ TEST_F(MirrorsTest, DoesNotLetThoseWaitForHistoryWhoDidNotAskForIt) {
     return answer;
   };
   const auto recorder = open();
-  streams->find(kOdometry)->want_history(0, true);
+  streams->find(kOdometry)->want_history(true);
   serve(10);
   EXPECT_FALSE(open_without()->has_value()) << "there is no sample yet";
   samples(10, 10);
@@ -231,91 +231,6 @@ TEST_F(MirrorsTest, DoesNotLetThoseWaitForHistoryWhoDidNotAskForIt) {
   EXPECT_FALSE(recorder->has_value()) << "the history is still on its way";
   owner->send_caught_up();
   wait(recorder);
-}
-
-class MirrorHistoryTest : public MirrorsTest {
- protected:
-  MirrorHistoryTest() {
-    greeting.features.emplace_back(wire::kFeatureNewestFirst);
-    owner->greet_as(greeting);
-  }
-  net::Frame confirm(const net::Frame& subscribe, Tid first) {
-    net::Frame frame = subscribed_frame(subscribe, theirs.incarnation, first);
-    frame.mutable_subscribed()->set_newest_first(true);
-    owner->send(frame);
-    return subscribe;
-  }
-  // Answers Open and Subscribe; returns the latter.
-  net::Subscribe serve_newest_first(Tid first) {
-    owner->send(opened_frame(owner->receive(), theirs));
-    return confirm(owner->receive(), first).subscribe();
-  }
-  // A mirror that has samples 5 and 6, and after a cut 12.
-  std::shared_ptr<Stream> opened_and_cut() {
-    const auto answer = open();
-    EXPECT_TRUE(serve_newest_first(5).from_newest());
-    samples(5, 6);
-    owner->send_caught_up();
-    std::shared_ptr<Stream> stream = wait(answer);
-    owner->cut();
-    catalog.host_up(greeting, owner->address());
-    EXPECT_TRUE(serve_newest_first(12).from_newest());
-    samples(12, 12);
-    owner->send_caught_up();
-    until_newest(*stream, 12);
-    until_state(proto::Mirror::LIVE);
-    return stream;
-  }
-  // What it asks the owner for.
-  Tid want(Tid from) {
-    streams->find(kOdometry)->want_history(from, false);
-    const net::Frame frame = owner->receive();
-    EXPECT_TRUE(frame.has_subscribe()) << frame.ShortDebugString();
-    return confirm(frame, frame.subscribe().from_tid()).subscribe().from_tid();
-  }
-  wire::Greeting greeting = greeting_of("pc2");
-};
-
-TEST_F(MirrorHistoryTest, IsFetchedFromWhereAProgramReadsOn) {
-  const std::shared_ptr<Stream> stream = opened_and_cut();
-  EXPECT_EQ(want(7), 7);
-  until_state(proto::Mirror::FILLING);
-  EXPECT_FALSE(state().history_wanted()) << "there is more";
-  samples(7, 11);
-  owner->send_caught_up();
-  until_state(proto::Mirror::LIVE);
-  // After another cut no program needs that again.
-  owner->cut();
-  catalog.host_up(greeting, owner->address());
-  EXPECT_TRUE(serve_newest_first(13).from_newest());
-}
-
-TEST_F(MirrorHistoryTest, IsNotAskedForWhenItComesAnyway) {
-  const std::shared_ptr<Stream> stream = opened_and_cut();
-  samples(15, 15);
-  until_newest(*stream, 15);
-  streams->find(kOdometry)->want_history(13, false);
-  run_turns(loop, 16);
-  EXPECT_FALSE(owner->has_request()) << "the owner passed 13 and 14 over, and sends them later";
-}
-
-TEST_F(MirrorHistoryTest, IsFetchedAsAWholeWhenAPartIsTooLittle) {
-  const std::shared_ptr<Stream> stream = opened_and_cut();
-  EXPECT_EQ(want(11), 11);
-  samples(11, 11);
-  owner->send_caught_up();
-  until_state(proto::Mirror::LIVE);
-  EXPECT_EQ(want(10), 0);
-  EXPECT_TRUE(state().history_wanted());
-}
-
-TEST_F(MirrorHistoryTest, IsAskedForWhenTheOwnerIsBack) {
-  const std::shared_ptr<Stream> stream = opened_and_cut();
-  owner->cut();
-  until_state(proto::Mirror::OWNER_UNAVAILABLE);
-  streams->find(kOdometry)->want_history(8, false);
-  catalog.host_up(greeting, owner->address());
-  EXPECT_EQ(serve_newest_first(8).from_tid(), 8);
 }
 
 TEST_F(MirrorsTest, FailsWithAReasonWhenTheOwnerDoesNotAnswer) {

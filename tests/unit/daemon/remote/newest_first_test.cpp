@@ -31,7 +31,7 @@ class Channel final : private FrameConnection::Observer, private SamplePump::Obs
         link_(loop, std::make_unique<MemoryTransport>(peer), *this, 1U << 20),
         sender_(*owner.mapping, link_, {true, &budget_}) {
     net::Subscribe request;
-    mirror.resume(true, 0, request);
+    mirror.resume(true, true, request);
     const Tid first = request.from_oldest() ? 0 : request.from_tid();
     EXPECT_TRUE(mirror.on_subscribed_untrusted(first, true, 0));
     SamplePump::Plan plan;
