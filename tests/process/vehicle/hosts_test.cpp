@@ -141,6 +141,10 @@ TEST_F(VehicleHosts, DrawTheSameMapWhenEachDssmdIsKilledDuringTheDrive) {
       dssm::test::start(test::mapper(map_path("map")), {pc3->environment()}),
       dssm::test::start(test::source("lidar", kToS, {"--speed", "100"}), {pc2->environment()}),
       dssm::test::start(test::source("encoder", kToS, {"--speed", "100"}), {pc1->environment()})};
+  // The encoder may be done when its dssmd is killed; then this reader gives its stream back.
+  dssm::Session at_pc1 = test::connect(*pc1);
+  const dssm::RawReader odometry =
+      at_pc1.await_raw_reader(dssm::StreamId{"odometry", 0, ""}, dssm::kNever).value();
   dssm::Session session = test::connect(*pc2);
   dssm::RawReader poses =
       session.await_raw_reader(dssm::StreamId{"pose", 0, ""}, dssm::kNever).value();
