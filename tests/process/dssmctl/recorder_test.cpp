@@ -48,6 +48,21 @@ class RecorderOf : public CtlTest {
     return writer;
   }
 
+  // Ends the recording: of so many samples it has some, and counts the others as lost.
+  void finish_and_count(std::uint64_t written) {
+    ASSERT_TRUE(recorder_->finish());
+    const RecordingProgress progress = recorder_->progress();
+    EXPECT_GT(progress.samples, 0U);
+    EXPECT_EQ(progress.samples + progress.lost_samples, written);
+  }
+  // Of each stream in the file.
+  std::vector<std::uint64_t> recorded_samples() const {
+    const Recording recording = Recording::open(file_).value();
+    std::vector<std::uint64_t> samples;
+    for (const RecordedStreamInfo& stream : recording.streams()) samples.push_back(stream.samples);
+    return samples;
+  }
+
   TestFolder folder_;
   std::string file_ = folder_.file("a.mcap");
   std::unique_ptr<ctl::Recorder> recorder_;
@@ -69,10 +84,7 @@ TEST_F(RecorderOf, AStreamHasAllTypesThatItHadInATurn) {
             std::vector<std::string>(3,
                                      "'again:0@pc1' is opened again: its samples are of "
                                      "another type now"));
-  const Recording recording = Recording::open(file_).value();
-  std::vector<std::uint64_t> samples;
-  for (const RecordedStreamInfo& stream : recording.streams()) samples.push_back(stream.samples);
-  EXPECT_EQ(samples, (std::vector<std::uint64_t>{0, 5, 6, 7}));
+  EXPECT_EQ(recorded_samples(), (std::vector<std::uint64_t>{0, 5, 6, 7}));
   EXPECT_EQ(recorder_->progress().lost_samples, 0U);
 }
 
@@ -81,10 +93,7 @@ TEST_F(RecorderOf, AStreamOfAnotherTypeLosesWhatItsRingOverwroteBeforeItWasOpene
   start(writer.id());
   writer = replace<float>(1000, 8);
   await_opened(writer.id());
-  ASSERT_TRUE(recorder_->finish());
-  const RecordingProgress progress = recorder_->progress();
-  EXPECT_GT(progress.samples, 0U);
-  EXPECT_EQ(progress.samples + progress.lost_samples, 1000U);
+  finish_and_count(1000);
 }
 
 TEST_F(RecorderOf, AStreamThatIsCreatedAgainTwiceMeanwhileHasAllSamples) {
@@ -97,10 +106,7 @@ TEST_F(RecorderOf, AStreamThatIsCreatedAgainTwiceMeanwhileHasAllSamples) {
   ASSERT_TRUE(recorder_->finish());
   EXPECT_EQ(recorder_->streams(), 1U);
   EXPECT_EQ(recorder_->take_notices(), std::vector<std::string>());
-  const Recording recording = Recording::open(file_).value();
-  std::vector<std::uint64_t> samples;
-  for (const RecordedStreamInfo& stream : recording.streams()) samples.push_back(stream.samples);
-  EXPECT_EQ(samples, (std::vector<std::uint64_t>{0, 5, 6}));
+  EXPECT_EQ(recorded_samples(), (std::vector<std::uint64_t>{0, 5, 6}));
 }
 
 TEST_F(RecorderOf, AStreamThatComesLaterLosesWhatItsRingOverwroteBeforeItWasOpened) {
@@ -108,10 +114,7 @@ TEST_F(RecorderOf, AStreamThatComesLaterLosesWhatItsRingOverwroteBeforeItWasOpen
   start(other.id());
   const RawWriter writer = replace<float>(1000, 8);
   await_opened(writer.id());
-  ASSERT_TRUE(recorder_->finish());
-  const RecordingProgress progress = recorder_->progress();
-  EXPECT_GT(progress.samples, 0U);
-  EXPECT_EQ(progress.samples + progress.lost_samples, 1000U);
+  finish_and_count(1000);
 }
 
 // As new samples do, those of the past may wait in their ring for others.
@@ -125,10 +128,7 @@ TEST_F(RecorderOf, ThePastLosesWhatItsRingOverwroteAfterItWasOpened) {
                   .value();
   await([&] { return recorder_->take() && recorder_->streams() == 1; });
   for (int i = 8; i < 1000; ++i) writer.write(payload);
-  ASSERT_TRUE(recorder_->finish());
-  const RecordingProgress progress = recorder_->progress();
-  EXPECT_GT(progress.samples, 0U);
-  EXPECT_EQ(progress.samples + progress.lost_samples, 1000U);
+  finish_and_count(1000);
 }
 
 // Its reader could have continued with any type of that size before it got a name.
