@@ -363,7 +363,8 @@ bool LocalService::go_on(ClientNumber number) {
   if (client.watch) {
     if (tell_news(number, end_of_news())) return true;
     if (!clients_.contains(number)) return false;
-    if (client.watch->is_telling) return tell_streams(number);
+    // Sending may have ended the watch alone.
+    if (client.watch && client.watch->is_telling) return tell_streams(number);
   }
   return serve_deferred(number);
 }

@@ -40,6 +40,7 @@ class FakeClient final : public ClientOutput {
   ~FakeClient() { service_.disconnect(number_); }
 
   void send(std::string bytes, std::vector<UniqueFd> descriptors) override {
+    if (ends_at_next) return stop_reading();
     for (std::string_view rest = bytes; !rest.empty();) {
       const auto space = buffer.space();
       const std::size_t part = std::min(space.size(), rest.size());
@@ -107,6 +108,7 @@ class FakeClient final : public ClientOutput {
   std::vector<UniqueFd> last_descriptors;
   DescriptorQueue offered;
   bool wants_turn = false;
+  bool ends_at_next = false;  // what it is sent next finds that it does not read any more
 
  private:
   static Identity program_of(std::int32_t pid, std::uint32_t uid) {

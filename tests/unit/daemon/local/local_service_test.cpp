@@ -241,6 +241,25 @@ TEST(LocalService, ServesOnlyChangesToAClientThatReceivesNothing) {
   EXPECT_EQ((*daemon.registry.find({"a", 0, ""}))->property().value(), "x");
 }
 
+TEST(LocalService, EndsTheWatchOfAClientThatStopsReadingWhileItIsTold) {
+  LocalDaemon daemon;
+  FakeClient client(daemon.service, 5), watcher(daemon.service, 6);
+  client.greet(), watcher.greet();
+  local::Request watch;
+  watch.mutable_watch();
+  EXPECT_TRUE(watcher.ask(watch).has_done());
+  client.ask(create_request("a"));
+  watcher.ends_at_next = true;  // an event of a change
+  EXPECT_FALSE(watcher.take_turn());
+  FakeClient late(daemon.service, 7);
+  late.greet().ends_at_next = true;  // one of the streams that exist
+  watch.set_serial(2);
+  EXPECT_TRUE(late.put(watch));
+  EXPECT_FALSE(late.take_turn());
+  client.ask(create_request("b"));
+  EXPECT_FALSE(watcher.wants_turn || late.wants_turn) << "they do not watch any more";
+}
+
 TEST(LocalService, TellsManyStreamsInParts) {
   constexpr int kStreams = 2 * LocalService::kStreamsPerTurn + 1;
   LocalDaemon daemon;
