@@ -12,6 +12,7 @@
 #include <cstring>
 #include <dssm/recording.hpp>
 #include <filesystem>
+#include <limits>
 #include <optional>
 
 #include "client/dssmctl/names.hpp"
@@ -36,7 +37,7 @@ struct Converted {
 
 // --- to MCAP
 
-// Writes samples, properties and triggers; of tids that are missing, a gap.
+// Writes samples, properties, gaps and triggers.
 class McapOutput {
  public:
   McapOutput(RecordingWriter file, const Recording& recording)
@@ -44,7 +45,7 @@ class McapOutput {
         recording_(recording),
         numbers_(recording.streams().size()),
         properties_(recording.streams().size()),
-        last_(recording.streams().size()) {}
+        gaps_(recording.streams().size()) {}
 
   Result<void> add(std::size_t stream) {
     RecordedStream about = recording_.streams()[stream];
@@ -54,18 +55,15 @@ class McapOutput {
   }
   Result<void> write(const RecordedSample& sample) {
     DSSM_TRY(write_properties(sample.stream, sample.info.time));
-    const std::uint32_t number = *numbers_[sample.stream];
-    std::optional<Tid>& last = last_[sample.stream];
-    if (const Tid next = last.value_or(sample.info.tid - 1) + 1; next < sample.info.tid) {
-      DSSM_TRY(file_.add_gap(number, next, static_cast<std::uint64_t>(sample.info.tid - next)));
-    }
-    last = sample.info.tid;
-    return file_.write(number, sample.info, sample.clock_error, sample.payload);
+    DSSM_TRY(write_gaps(sample.stream, sample.info.tid));
+    return file_.write(*numbers_[sample.stream], sample.info, sample.clock_error, sample.payload);
   }
   bool takes(std::size_t stream) const { return numbers_[stream].has_value(); }
   Result<void> finish() {
     for (std::size_t stream = 0; stream < numbers_.size(); ++stream) {
-      if (takes(stream)) DSSM_TRY(write_properties(stream, Time::max()));
+      if (!takes(stream)) continue;
+      DSSM_TRY(write_properties(stream, Time::max()));
+      DSSM_TRY(write_gaps(stream, std::numeric_limits<Tid>::max()));
     }
     for (const RecordedTrigger& trigger : recording_.triggers()) {
       DSSM_TRY(file_.add_trigger(trigger));
@@ -85,11 +83,22 @@ class McapOutput {
     return {};
   }
 
+  // Those before sample `tid`. Other tids that are missing are no loss: of a black box, what came
+  // between two incidents was not to be kept.
+  Result<void> write_gaps(std::size_t stream, Tid tid) {
+    const std::vector<RecordedGap>& all = recording_.streams()[stream].gaps;
+    std::size_t& next = gaps_[stream];
+    for (; next < all.size() && all[next].first < tid; ++next) {
+      DSSM_TRY(file_.add_gap(*numbers_[stream], all[next].first, all[next].count));
+    }
+    return {};
+  }
+
   RecordingWriter file_;
   const Recording& recording_;
   std::vector<std::optional<std::uint32_t>> numbers_;  // of each stream of the recording
   std::vector<std::size_t> properties_;                // how many are written
-  std::vector<std::optional<Tid>> last_;
+  std::vector<std::size_t> gaps_;                      // the same
 };
 
 // --- to logs

@@ -496,15 +496,19 @@ void FileReader::add_metadata(const MetadataIndex& about, std::span<const std::b
     triggers_.push_back({std::string(entry("name")), std::string(entry("reason")),
                          std::string(entry("host")), time_from_ns(time_ns)});
   } else if (name == kGapName) {
-    std::uint64_t lost = 0;
+    std::vector<RecordedGap> gaps;
     for (std::string_view rest = entry("gaps"); !rest.empty();) {
       const std::size_t plus = rest.find('+');
       if (plus == rest.npos) break;
-      std::uint64_t count = 0;
+      RecordedGap gap;
+      const auto first = std::from_chars(rest.data(), rest.data() + plus, gap.first);
       const auto [end, error] =
-          std::from_chars(rest.data() + plus + 1, rest.data() + rest.size(), count);
-      if (error != std::errc()) break;
-      lost += count;
+          std::from_chars(rest.data() + plus + 1, rest.data() + rest.size(), gap.count);
+      if (first.ec != std::errc() || error != std::errc() || gap.first < 0 ||
+          gap.count > static_cast<std::uint64_t>(INT64_MAX - gap.first)) {
+        break;
+      }
+      gaps.push_back(gap);
       rest.remove_prefix(
           std::min<std::size_t>(static_cast<std::size_t>(end - rest.data()) + 1, rest.size()));
     }
@@ -513,7 +517,8 @@ void FileReader::add_metadata(const MetadataIndex& about, std::span<const std::b
       if (channel.channel.topic == entry("topic") && channel.stream &&
           incarnation != channel.channel.metadata.end() &&
           incarnation->second == entry("incarnation")) {
-        channel.lost_samples += lost;
+        for (const RecordedGap& gap : gaps) channel.lost_samples += gap.count;
+        channel.gaps.insert(channel.gaps.end(), gaps.begin(), gaps.end());
       }
     }
   }

@@ -154,6 +154,7 @@ Result<void> Content::add(std::uint32_t number) {
     }
     add_properties(at, number, channel);
     streams[at].lost_samples += channel.lost_samples;
+    streams[at].gaps.insert(streams[at].gaps.end(), channel.gaps.begin(), channel.gaps.end());
   }
 
   // Other programs' messages are counted over all files.
@@ -231,6 +232,9 @@ Result<std::vector<std::byte>> Content::property(std::size_t stream, std::size_t
 
 void Content::finish() {
   std::ranges::stable_sort(triggers, {}, &RecordedTrigger::time);
+  for (RecordedStreamInfo& stream : streams) {
+    std::ranges::stable_sort(stream.gaps, {}, &RecordedGap::first);
+  }
   for (Life& life : lives) index_times(life, life.parts.size());
   // Of another program's channels nothing tells how long messages may be: all of one topic have the
   // longest one's length.

@@ -295,7 +295,19 @@ void DaemonProcess::start() {
   ::unlink(notify_path.c_str());
 }
 
+void DaemonProcess::expect_no_crash() const {
+  siginfo_t ended{};
+  if (::waitid(P_PID, static_cast<id_t>(pid_), &ended, WEXITED | WNOHANG | WNOWAIT)) return;
+  const bool is_expected = ended.si_pid == 0 || ended.si_status == 0 ||
+                           (ended.si_code == CLD_KILLED && ended.si_status == SIGKILL);
+  if (is_expected) return;
+  std::fprintf(stderr, "test harness: dssmd of '%s' ended by itself, with %s %d\n", dir_.c_str(),
+               ended.si_code == CLD_EXITED ? "status" : "signal", ended.si_status);
+  std::abort();
+}
+
 void DaemonProcess::kill_hard() {
+  expect_no_crash();
   ::kill(pid_, SIGKILL);
   wait_for(pid_);
   pid_ = -1;

@@ -104,6 +104,10 @@ class DaemonProcess {
   std::string address() const { return addresses_.empty() ? "" : addresses_.front(); }
   const std::vector<std::string>& addresses() const { return addresses_; }
 
+  // Ends the test program with a message if dssmd has ended with an error. kill_hard() and the
+  // destructor do so, too: else the end of a dssmd would go unnoticed, or be seen as a timeout.
+  void expect_no_crash() const;
+
   void kill_hard();                    // SIGKILL, and waits for its end
   int stop();                          // SIGTERM, and its exit status
   void start();                        // again, in the same folder

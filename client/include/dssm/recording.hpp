@@ -159,11 +159,19 @@ class RecordingWriter {
 
 // --- reading
 
+// Samples first .. first + count - 1 that could not be kept.
+struct RecordedGap {
+  Tid first = 0;
+  std::uint64_t count = 0;
+  friend bool operator==(const RecordedGap&, const RecordedGap&) = default;
+};
+
 // A stream in a recording, of one incarnation.
 struct RecordedStreamInfo : RecordedStream {  // with the last property that it had
   std::uint64_t samples = 0;
   std::uint64_t payload_bytes = 0;
-  std::uint64_t lost_samples = 0;  // of add_gap()
+  std::uint64_t lost_samples = 0;  // of add_gap(), and records of a log that are no samples
+  std::vector<RecordedGap> gaps;   // of add_gap(), in the order of tids
   Tid first_tid = kNoTid, last_tid = kNoTid;
   Time first_time{}, last_time{};  // the least and the greatest; meaningless without samples
   // Since when it had each of its properties, which Recording::property() returns by their index

@@ -228,6 +228,36 @@ TEST_F(Convert, KeepsAllPropertiesWithTheirTimes) {
   EXPECT_EQ(recording.property(1, 0).value(), std::vector{std::byte{2}});
 }
 
+// As a black box's two incidents are: what came between them was not to be kept.
+TEST_F(Convert, KeepsWhatWasLost) {
+  fs::create_directory(file("incidents"));
+  RecordedStream stream;
+  stream.id = {"pose", 0, "pc1"};
+  stream.type.payload_bytes = 8;
+  stream.incarnation = 1;
+  const std::byte payload[8] = {};
+  const auto write_incident = [&](const std::string& name, Tid first) {
+    RecordingWriter writer = RecordingWriter::create(file("incidents/" + name)).value();
+    const std::uint32_t number = writer.add_stream(stream).value();
+    ASSERT_TRUE(writer.add_gap(number, first, 2));
+    for (const Tid tid : {first + 2, first + 6}) {
+      if (tid == first + 6) ASSERT_TRUE(writer.add_gap(number, first + 3, 3));
+      ASSERT_TRUE(writer.write(number, {tid, time_from_ns(tid), 0ns, 8}, 0ns, payload));
+    }
+    ASSERT_TRUE(writer.add_gap(number, first + 7, 1));
+    ASSERT_TRUE(writer.finish());
+  };
+  write_incident("a.mcap", 10);
+  write_incident("b.mcap", 1000);
+  output({"convert", file("incidents"), file("all.mcap")});
+  const Recording recording = Recording::open(file("all.mcap")).value();
+  EXPECT_EQ(recording.streams()[0].samples, 4U);
+  EXPECT_EQ(recording.streams()[0].lost_samples, 12U);
+  EXPECT_EQ(
+      recording.streams()[0].gaps,
+      (std::vector<RecordedGap>{{10, 2}, {13, 3}, {17, 1}, {1000, 2}, {1003, 3}, {1007, 1}}));
+}
+
 TEST_F(Convert, KeepsWhatTriggeredTheRecording) {
   RecordingWriter writer = RecordingWriter::create(file("a.mcap")).value();
   RecordedStream stream;

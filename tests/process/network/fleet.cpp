@@ -22,6 +22,12 @@ Fleet::Fleet(std::unique_ptr<Network> network, const std::vector<std::string>& e
   }
 }
 
+bool Fleet::runs(int host) {
+  if (dssmd(host).pid() <= 0) return false;
+  dssmd(host).expect_no_crash();
+  return true;
+}
+
 void Fleet::kill_dssmd(int host) {
   if (runs(host)) dssmd(host).kill_hard();
 }

@@ -32,7 +32,7 @@ class Fleet {
   // Kill it unless it is dead; start it unless it runs.
   void kill_dssmd(int host);
   void start_dssmd(int host);
-  bool runs(int host) { return dssmd(host).pid() > 0; }
+  bool runs(int host);  // ends the test program when it has crashed
 
   // A connection of this process to the host's dssmd. Programs use the network only through dssmd,
   // so this process need not be in the host's namespace.

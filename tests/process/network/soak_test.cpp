@@ -164,6 +164,7 @@ class Soak : public NetworkTest {
     std::thread watchdog([&] {
       for (const MonoTime end = deadline_in(kTimeout); !ended && !give_up;) {
         if (MonoClock::now() > end) give_up = true;
+        for (int host = 1; host <= kHosts; ++host) EXPECT_TRUE(fleet->runs(host));
         std::this_thread::sleep_for(50ms);
       }
     });

@@ -116,7 +116,9 @@ TEST_P(WriteRead, KeepsAllThatStreamsAndSamplesHave) {
   EXPECT_EQ(recording.streams()[0].first_time, Time::min());
   EXPECT_EQ(recording.streams()[0].last_time, Time::max());
   EXPECT_EQ(recording.streams()[1].lost_samples, 5U);
+  EXPECT_EQ(recording.streams()[1].gaps, (std::vector<RecordedGap>{{7, 5}}));
   EXPECT_EQ(recording.streams()[2].lost_samples, 1ULL << 40);
+  EXPECT_EQ(recording.streams()[2].gaps, (std::vector<RecordedGap>{{0, 1ULL << 40}}));
   EXPECT_EQ(recording.streams()[3].last_tid, INT64_MAX);
 
   RecordedRawReader reader = recording.open_raw_reader({"plain", 0, ""}).value();
