@@ -87,11 +87,27 @@ Result<void> check_hosts(Session& session, const std::vector<std::string>& wante
   return {};
 }
 
+// Hosts that could have streams: those that are known and not reached.
+std::vector<std::string> missing_hosts(Session& session) {
+  std::vector<std::string> names;
+  const Result<std::vector<HostInfo>> hosts = session.list_hosts();
+  if (!hosts) return names;
+  for (const HostInfo& host : *hosts) {
+    const bool is_missing = host.state == HostState::connecting || host.state == HostState::down ||
+                            host.state == HostState::refused;
+    if (!is_missing || host.reason == HostReason::spare_address) continue;
+    names.push_back(host.name.empty() ? host.addresses.front() : host.name);
+  }
+  return names;
+}
+
 // For standard error, so that standard output stays a table.
-std::string why_empty(const LsOptions& options, std::size_t all) {
+std::string why_empty(Session& session, const LsOptions& options, std::size_t all) {
   if (all == 0) {
-    return options.own ? "this PC owns no streams"
-                       : "no streams; programs create them, or 'dssmctl create'";
+    if (options.own) return "this PC owns no streams";
+    const std::vector<std::string> missing = missing_hosts(session);
+    if (missing.empty()) return "no streams; programs create them, or 'dssmctl create'";
+    return fmt::format("no streams; not reached: {}; see `dssmctl hosts`", list_text(missing, 5));
   }
   const std::string others =
       fmt::format("there {} {} other{}", all == 1 ? "is" : "are", all, all == 1 ? "" : "s");
@@ -233,7 +249,7 @@ Result<void> run(const LsOptions& options, Output& out) {
     print_table(listing, out);
     if (listing.streams.empty()) {
       out.flush();
-      print_error(fmt::format("dssmctl: ls: {}\n", why_empty(options, all)));
+      print_error(fmt::format("dssmctl: ls: {}\n", why_empty(session, options, all)));
     }
   }
   return {};

@@ -54,6 +54,14 @@ bool StreamFilter::takes(const StreamId& id) const {
                      [&](const std::string& pattern) { return is_named(id, pattern); });
 }
 
+std::vector<std::string> StreamFilter::unused_patterns(const std::vector<StreamId>& ids) const {
+  std::vector<std::string> unused = patterns_;
+  std::erase_if(unused, [&](const std::string& pattern) {
+    return std::ranges::any_of(ids, [&](const StreamId& id) { return is_named(id, pattern); });
+  });
+  return unused;
+}
+
 std::string pattern_of(const std::string& name) {
   std::string pattern;
   for (const char c : name) {

@@ -57,6 +57,8 @@ class StreamFilter {
       : hosts_(std::move(hosts)), patterns_(std::move(patterns)) {}
 
   bool takes(const StreamId& id) const;
+  // The patterns that none of `ids` fits.
+  std::vector<std::string> unused_patterns(const std::vector<StreamId>& ids) const;
 
  private:
   std::vector<std::string> hosts_, patterns_;

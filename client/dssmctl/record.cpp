@@ -5,6 +5,7 @@
 
 #include <algorithm>
 #include <filesystem>
+#include <utility>
 
 #include "client/dssmctl/black_box.hpp"
 #include "client/dssmctl/open_stream.hpp"
@@ -84,6 +85,7 @@ class RecordingRun {
     Result<void> finished = recorder_.finish();
     if (finished) finished = keep_quota();
     report_notices();
+    if (recorder_.streams() > 0) report_unused();
     report_undescribed();
     out_.clear_line();
     print_summary();
@@ -108,11 +110,7 @@ class RecordingRun {
 
   void report() {
     report_notices();
-    if (recorder_.streams() == 0 && !has_waited_ &&
-        MonoClock::now() - started_ > kFirstNoticeTime) {
-      has_waited_ = true;
-      notice("no stream fits; what comes is recorded");
-    }
+    if (MonoClock::now() - started_ > kFirstNoticeTime) report_unused();
     if (options_.json) return;
     out_.redraw_line(
         [&] { return fmt::format("{}: {}", escaped(file_.string()), progress_text(recorder_)); });
@@ -121,6 +119,17 @@ class RecordingRun {
   void report_notices() {
     for (const std::string& text : recorder_.take_notices()) notice(text);
     for (const std::string& text : folder_.take_notices()) notice(text);
+  }
+
+  // Once: a name with a mistake in it would else be missed when the recording is needed.
+  void report_unused() {
+    if (std::exchange(has_named_unused_, true)) return;
+    const std::vector<std::string> unused = recorder_.unused_patterns();
+    if (recorder_.streams() == 0) {
+      notice("no stream fits; what comes is recorded");
+    } else if (!unused.empty()) {
+      notice(fmt::format("no stream fits {} so far", list_text(unused)));
+    }
   }
 
   void report_undescribed() {
@@ -155,7 +164,7 @@ class RecordingRun {
   Output& out_;
   MonoTime end_;
   MonoTime started_ = MonoClock::now();
-  bool has_waited_ = false;
+  bool has_named_unused_ = false;
 };
 
 Result<void> repair(const RecordOptions& options, Output& out) {

@@ -391,6 +391,13 @@ bool Recorder::Opener::has_tried_all() const {
   return untried_ == 0 && opened_.empty();
 }
 
+std::vector<std::string> Recorder::Opener::unused_patterns(std::vector<StreamId> ids) const {
+  const std::lock_guard lock(mutex_);
+  for (const Wanted& wanted : wanted_) ids.push_back(wanted.stream.id);
+  for (const Source& source : opened_) ids.push_back(source.reader.id());
+  return plan_.filter.unused_patterns(ids);
+}
+
 // --- recording
 
 Result<std::unique_ptr<Recorder>> Recorder::start(Session session,
@@ -767,6 +774,12 @@ std::vector<std::string> Recorder::streams_without_fields() const {
     if (!file_->has_fields(source.number)) names.push_back(source.reader.id().str());
   }
   return names;
+}
+
+std::vector<std::string> Recorder::unused_patterns() const {
+  std::vector<StreamId> ids;
+  for (const Source& source : sources_) ids.push_back(source.reader.id());
+  return opener_.unused_patterns(std::move(ids));
 }
 
 std::vector<std::string> Recorder::take_notices() { return opener_.take_notices(); }

@@ -84,6 +84,8 @@ class Recorder {
   bool is_past_late();
 
   std::size_t streams() const { return sources_.size(); }
+  // The plan's patterns that no stream fits, of those that are recorded or could not be opened yet.
+  std::vector<std::string> unused_patterns() const;
   // Those of which the file has only bytes: they were not described.
   std::vector<std::string> streams_without_fields() const;
   // Of the file, or of the last one; there was one.
@@ -176,6 +178,8 @@ class Recorder {
     std::vector<StreamId> take_described();
     std::vector<std::string> take_notices();
     bool has_tried_all() const;  // of the streams that there were at begin()
+    // Those that none of `ids` fits, and none that is still to be opened.
+    std::vector<std::string> unused_patterns(std::vector<StreamId> ids) const;
 
    private:
     struct Wanted {

@@ -77,7 +77,7 @@ struct FileChannel {
   Channel channel;
   std::optional<RecordedStream> stream;  // with its last property; nullopt: of another program
   std::vector<PropertyPlace> properties;
-  bool is_left_out = false;        // no stream can be made of it
+  bool is_left_out = false;  // no stream can be made of it
   std::vector<RecordedGap> gaps;
   std::uint64_t lost_samples = 0;  // of gaps, and records of a log that are left out
   std::uint64_t max_bytes = 0;     // of a message, of another program's channel

@@ -253,9 +253,8 @@ TEST_F(Convert, KeepsWhatWasLost) {
   const Recording recording = Recording::open(file("all.mcap")).value();
   EXPECT_EQ(recording.streams()[0].samples, 4U);
   EXPECT_EQ(recording.streams()[0].lost_samples, 12U);
-  EXPECT_EQ(
-      recording.streams()[0].gaps,
-      (std::vector<RecordedGap>{{10, 2}, {13, 3}, {17, 1}, {1000, 2}, {1003, 3}, {1007, 1}}));
+  EXPECT_EQ(recording.streams()[0].gaps,
+            (std::vector<RecordedGap>{{10, 2}, {13, 3}, {17, 1}, {1000, 2}, {1003, 3}, {1007, 1}}));
 }
 
 TEST_F(Convert, KeepsWhatTriggeredTheRecording) {

@@ -318,6 +318,14 @@ TEST_F(Record, TakesOnlyStreamsOfATypeIfAsked) {
   EXPECT_TRUE(contains(text, ": 20 samples of 2 streams, ")) << text;
 }
 
+TEST_F(Record, NamesPatternsThatNoStreamFits) {
+  auto pose = session_.create<RecordedPose>("pose", depth_of(64)).value();
+  const Finished done =
+      ctl({"record", "po*", "laser", "--past", "1s", "-o", folder_.file("b.mcap")});
+  EXPECT_EQ(done.exit_status, 0) << done.err;
+  EXPECT_TRUE(contains(done.err, "no stream fits laser so far")) << done.err;
+}
+
 TEST_F(Record, KeepsTheQuotaOfItsFolder) {
   constexpr std::uint64_t kBytes = 100'000;  // of a sample
   constexpr std::uintmax_t kQuota = 8'000'000;

@@ -46,6 +46,13 @@ TEST_F(Remote, LsShowsTheStreamsOfAllHostsOwnOnesFirst) {
   EXPECT_EQ(json({"ls", "--own"})["streams"].size(), 1U);
 }
 
+TEST_F(Remote, LsWithoutStreamsNamesHostsThatAreNotReached) {
+  EXPECT_TRUE(ctl({"ls"}).err.starts_with("dssmctl: ls: no streams; programs create them"));
+  pc2_.kill_hard();
+  await_state("pc2", HostState::down);
+  EXPECT_EQ(ctl({"ls"}).err, "dssmctl: ls: no streams; not reached: pc2; see `dssmctl hosts`\n");
+}
+
 TEST_F(Remote, NamesOpenTheRightStreamWhereSeveralHaveTheName) {
   auto here = session_.create<double>("odom", depth_of(4)).value();
   auto on_2 = on_pc2_.create<double>("odom", depth_of(4)).value();

@@ -60,6 +60,8 @@ TEST(StreamFilter, TakesStreamsOfTheGivenHostsOnly) {
   EXPECT_FALSE(filter.takes({"lidar", 0, "pc1"}));
   EXPECT_FALSE(filter.takes({"odom", 0, "pc2"}));
   EXPECT_TRUE(StreamFilter({}, {}).takes({"odom", 0, "pc2"}));
+  EXPECT_EQ(filter.unused_patterns({{"odom", 0, "pc2"}, {"lidar", 3, "pc3"}}),
+            std::vector<std::string>{"c*"});
 }
 
 TEST(PatternOf, FitsThatStreamOnly) {
