@@ -37,6 +37,8 @@ constexpr Duration kHistory = 5s;
 constexpr Duration kCut = 20s;     // much longer than the history
 constexpr Duration kWatched = 4s;  // after an event
 constexpr Duration kPoll = 1ms;
+// With the headers of Ethernet, IP and TCP.
+constexpr double kHeaderBytes = 66, kLargestPacket = 1514;
 
 double age_ns(Time time) { return static_cast<double>((WallClock::now() - time).count()); }
 
@@ -159,7 +161,8 @@ void measure_link(test::Network& network, const Hosts& hosts, int megabytes_per_
       return reader.read_newest(frame, info) == ReadStatus::ok ? std::optional(info.time)
                                                                : std::nullopt;
     };
-    const double link_ns = static_cast<double>(kFrameBytes) * 1e3 / megabytes_per_s;
+    const double link_ns = static_cast<double>(kFrameBytes) * 1e3 / megabytes_per_s *
+                           kLargestPacket / (kLargestPacket - kHeaderBytes);
     print_ages("just after opening" + tail, raw, watch(kWatched, newest), link_ns);
     print_ages("later" + tail, raw, watch(kWatched, newest), link_ns);
     const auto print_first = [&](const std::string& after) {
@@ -255,8 +258,7 @@ void measure_raw_beside(const Hosts& hosts, int megabytes_per_s, const std::stri
   const auto [small_out, small_in] = hosts.tcp_pair();
   const auto [large_out, large_in] = hosts.tcp_pair();
   const int out[] = {small_out, large_out}, in[] = {small_in, large_in};
-  // 85 % of the link are for both, with the headers of Ethernet, IP and TCP.
-  constexpr double kHeaderBytes = 66, kLargestPacket = 1514;
+  // 85 % of the link are for both, with the headers.
   constexpr double kSmallPerS =
       (kEncoderBytes + kHeaderBytes) * (std::chrono::seconds(1) / kEncoderPeriod);
   const auto rate = static_cast<std::uint64_t>((0.85e6 * megabytes_per_s - kSmallPerS) *
