@@ -85,7 +85,7 @@ class RecordingRun {
     Result<void> finished = recorder_.finish();
     if (finished) finished = keep_quota();
     report_notices();
-    if (recorder_.streams() > 0) report_unused();
+    report_unused();
     report_undescribed();
     out_.clear_line();
     print_summary();
@@ -110,11 +110,13 @@ class RecordingRun {
 
   void report() {
     report_notices();
-    if (MonoClock::now() - started_ > kFirstNoticeTime) report_unused();
+    if (may_have_opened()) report_unused();
     if (options_.json) return;
     out_.redraw_line(
         [&] { return fmt::format("{}: {}", escaped(file_.string()), progress_text(recorder_)); });
   }
+
+  bool may_have_opened() const { return MonoClock::now() - started_ > kFirstNoticeTime; }
 
   void report_notices() {
     for (const std::string& text : recorder_.take_notices()) notice(text);
@@ -125,10 +127,10 @@ class RecordingRun {
   void report_unused() {
     if (std::exchange(has_named_unused_, true)) return;
     const std::vector<std::string> unused = recorder_.unused_patterns();
-    if (recorder_.streams() == 0) {
-      notice("no stream fits; what comes is recorded");
-    } else if (!unused.empty()) {
+    if (!unused.empty()) {
       notice(fmt::format("no stream fits {} so far", list_text(unused)));
+    } else if (recorder_.streams() == 0 && may_have_opened()) {
+      notice("no stream fits; what comes is recorded");
     }
   }
 
