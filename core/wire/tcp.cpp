@@ -5,6 +5,7 @@
 #include "core/wire/tcp.hpp"
 
 #include <fcntl.h>
+#include <ifaddrs.h>
 #include <linux/tcp.h>  // glibc's tcp_info has no rates
 #include <netinet/in.h>
 #include <sys/time.h>
@@ -276,6 +277,35 @@ bool takes_ipv4_too(int socket) noexcept {
          ::getsockopt(socket, IPPROTO_IPV6, IPV6_V6ONLY, &only_6, &length) == 0 && !only_6;
 }
 
+std::string interface_without_carrier(const SocketAddress& address) {
+  // To connect a socket of UDP only chooses the route, and with it this PC's address.
+  const UniqueFd fd(::socket(address.storage.ss_family, SOCK_DGRAM | SOCK_CLOEXEC, 0));
+  if (!fd || ::connect(fd.get(), address.get(), address.length)) return {};
+  const Result<SocketAddress> local = local_address(fd.get());
+  if (!local) return {};
+  const std::optional<IpAddress> own = IpAddress::of(*local);
+  ifaddrs* all = nullptr;
+  if (!own || ::getifaddrs(&all)) return {};
+  std::string without;
+  for (const ifaddrs* each = all; each; each = each->ifa_next) {
+    if (!each->ifa_addr) continue;
+    SocketAddress one;
+    one.length = each->ifa_addr->sa_family == AF_INET    ? sizeof(sockaddr_in)
+                 : each->ifa_addr->sa_family == AF_INET6 ? sizeof(sockaddr_in6)
+                                                         : 0;
+    std::memcpy(&one.storage, each->ifa_addr, one.length);
+    if (one.length == 0 || IpAddress::of(one) != own) continue;
+    constexpr unsigned kLowerUp = 1U << 16;  // IFF_LOWER_UP; linux/if.h conflicts with net/if.h
+    if (each->ifa_flags & kLowerUp) {
+      without.clear();
+      break;
+    }
+    without = each->ifa_name;
+  }
+  ::freeifaddrs(all);
+  return without;
+}
+
 Result<UniqueFd> start_connect(const SocketAddress& address) {
   Result<UniqueFd> fd = tcp_socket(address);
   if (!fd) return fd;
@@ -301,6 +331,11 @@ Result<void> finish_connect(int socket, const SocketAddress& address) {
                                       "address?"};
   }
   return network_error(what, why, socket);
+}
+
+void discard_output_at_close(int socket) noexcept {
+  constexpr linger kAtOnce{1, 0};
+  static_cast<void>(::setsockopt(socket, SOL_SOCKET, SO_LINGER, &kAtOnce, sizeof kAtOnce));
 }
 
 void set_channel_options(int socket) noexcept {

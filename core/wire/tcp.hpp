@@ -15,6 +15,7 @@
 
 #include <dssm/result.hpp>
 #include <memory>
+#include <string>
 
 #include "core/base/unique_fd.hpp"
 #include "core/wire/address.hpp"
@@ -35,6 +36,13 @@ Result<SocketAddress> peer_address(int socket);  // IPv4 as such, also over a so
 // made with its defaults does.
 bool takes_ipv4_too(int socket) noexcept;
 
+// The interface of this PC that packets to `address` take, if it has no carrier: a cable is not
+// plugged in, Wi-Fi is not connected. A packet that is sent then is not only lost: the kernel asks
+// for the other side's hardware address once a second (arp(7), retrans_time_ms), so for up to a
+// second after the carrier is back nothing gets there. Empty: there is a carrier, or it is not
+// known. Sends nothing.
+std::string interface_without_carrier(const SocketAddress& address);
+
 // Begins to connect; the socket becomes writable when that succeeded or failed: then call
 // finish_connect(). Sets the options of the connected end.
 Result<UniqueFd> start_connect(const SocketAddress& address);
@@ -46,6 +54,10 @@ Result<void> finish_connect(int socket, const SocketAddress& address);
 
 // Sets the options of the accepted end.
 void set_channel_options(int socket) noexcept;
+
+// When the socket is closed, what waits to be sent is given up: else the kernel tries to send it for
+// up to 30 s, and looks for a host that is not there.
+void discard_output_at_close(int socket) noexcept;
 
 // The transport over a connected or accepted socket, for both ends of a connection; for the
 // accepted end it sets the socket's options.

@@ -51,6 +51,9 @@ void Dialer::restart(const Error& why) {
       if (!connection_->is_open()) return;  // on_closed() follows
       reason_ = why;
       given_up_ = true;
+      if (loop_.now() - connection_->last_heard() >= wire::kPeerTimeout) {
+        connection_->discard_output_at_close();
+      }
       return connection_->close_with(why);
     case State::look_up:
     case State::connect:
@@ -149,6 +152,12 @@ void Dialer::try_next_address(const Error& why) {
 }
 
 Result<void> Dialer::begin_attempt() {
+  if (const std::string name = wire::interface_without_carrier(plan_.address()); !name.empty()) {
+    return Error{Errc::unavailable,
+                 fmt::format("connect to '{}': interface '{}' has no carrier; is its cable plugged "
+                             "in, or its Wi-Fi connected?",
+                             plan_.address().str(), name)};
+  }
   UniqueFd socket = DSSM_TRY(wire::start_connect(plan_.address()));
   if (attempts_.size() == kMaxAttempts) attempts_.erase(std::next(attempts_.begin()));
   Attempt& attempt = attempts_.emplace_back();

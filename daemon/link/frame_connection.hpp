@@ -21,6 +21,7 @@
 #include <variant>
 
 #include "core/wire/frame_decoder.hpp"
+#include "core/wire/tcp.hpp"
 #include "core/wire/transport.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/memory_budget.hpp"
@@ -160,6 +161,10 @@ class FrameConnection final : private wire::FrameDelegate {
   void resume();
   bool is_paused() const noexcept { return input_.paused; }
 
+  // The peer does not answer: its end gives up what waits for it.
+  void discard_output_at_close() noexcept {
+    if (!closed_) wire::discard_output_at_close(transport_->fd());
+  }
   // Closes with a final failure for the peer (a Failure with serial 0), as far as the socket takes
   // it at once. on_closed() follows from the loop.
   void close_with(const Error& why);

@@ -2,11 +2,15 @@
 //
 // The promises of a fleet when cables are cut, names are equal and versions differ, tested on PCs
 // as network namespaces.
+#include <arpa/inet.h>
 #include <fcntl.h>
 #include <unistd.h>
 
 #include <algorithm>
+#include <cstdio>
 #include <dssm/pconnector.hpp>
+#include <fstream>
+#include <iterator>
 #include <thread>
 
 #include "tests/process/network/fleet.hpp"
@@ -118,6 +122,35 @@ TEST_F(Hosts, ThatAreUnreachableAreDownWithin3SecondsAndUpAgain) {
   }
   // The promise is 3 s; half a second more for a busy machine to notice.
   EXPECT_LT(noticed, 3500ms);
+}
+
+// Whether a connection to host 1 is left in the kernel of host 2, which may try to send something.
+bool has_connection(Fleet& fleet) {
+  const Inside inside = fleet.network().inside(2);
+  std::ifstream table("/proc/thread-self/net/tcp");
+  const std::string text{std::istreambuf_iterator<char>(table), {}};
+  in_addr address{};
+  ::inet_pton(AF_INET, Network::address(1).c_str(), &address);
+  char remote[32];
+  std::snprintf(remote, sizeof remote, " %08X:%04X ", address.s_addr, 13776);
+  return text.find(remote) != std::string::npos;
+}
+
+// Nothing is sent meanwhile: what the kernel cannot deliver delays what follows when the cable is
+// plugged in again.
+TEST_F(Hosts, AreNotCalledWithoutACarrier) {
+  if (!make_fleet(2)) return;
+  Session there = fleet->session(2);
+  await_up(there, 1);
+  fleet->network().cut(2);
+  await("the interface is named", [&] {
+    return host_info(there, "pc1").error.find("interface 'eth0' has no carrier") !=
+           std::string::npos;
+  });
+  EXPECT_FALSE(has_connection(*fleet));
+  fleet->network().heal(2);
+  await_up(there, 1);
+  EXPECT_TRUE(has_connection(*fleet));
 }
 
 TEST_F(Hosts, ThatDieAreDownAtOnceAndUpAgain) {
