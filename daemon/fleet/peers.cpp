@@ -157,7 +157,8 @@ void Peers::on_mdns_state(const MdnsInfo& state) {
 Peers::Occupied Peers::occupied() const {
   Occupied occupied;
   for (const Peer& peer : peers_) {
-    if (peer.is_up()) occupied.emplace(peer.connection->address(), &peer.them());
+    if (!peer.is_up()) continue;
+    occupied.emplace(peer.connection->address(), std::pair(peer.them().host_id, peer.them().host));
   }
   return occupied;
 }
@@ -195,10 +196,10 @@ void Peers::find_usable_addresses(Peer::Found& found, const Occupied& occupied) 
       continue;
     }
     const auto occupant = occupied.find(numbers.front().str());
-    if (occupant != occupied.end() && occupant->second->host_id != host.id) {
+    if (occupant != occupied.end() && occupant->second.first != host.id) {
       obstacle = {HostReason::not_accepted,
                   fmt::format("{} is announced at '{}', where host '{}' answers", who,
-                              address.str(), occupant->second->host)};
+                              address.str(), occupant->second.second)};
       continue;
     }
     found.usable.push_back(address);

@@ -109,8 +109,8 @@ class Peers final : public HostFinderObserver, private PeerConnection::Observer 
   PeerReport report() const { return {peers_, self_.host_id, catalog_, loop_.now()}; }
 
  private:
-  // Addresses, written as numbers, and which host answers there now.
-  using Occupied = std::map<std::string, const wire::Greeting*>;
+  // Addresses, written as numbers, and which host answers there now: its id and its name.
+  using Occupied = std::map<std::string, std::pair<wire::HostId, std::string>>;
 
   void on_peer_up(PeerConnection& connection) override;
   void on_peer_down(PeerConnection& connection, const Error& error, bool attempt) override;

@@ -497,6 +497,27 @@ TEST_F(FoundHostsTest, AreWarnedOfWhenTheyHaveOurName) {
   EXPECT_EQ(one->connections(), 1);
 }
 
+// A refused host, which another one is announced in place of, is reached as configured.
+TEST_F(FoundHostsTest, AreGivenUpWhileOthersAreAnnouncedAtTheirAddress) {
+  wire::Greeting namesake = self;
+  ++namesake.host_id[0];
+  one->greet_as(namesake), two->greet_as(namesake);
+  FoundHost found = host_at({at(*one)}, "pc1");
+  found.id = namesake.host_id;
+  start();
+  peers->on_host_found(found);
+  wait([&] { return !peers->report().own_warning().text.empty(); });
+  peers->on_host_found(host_at({at(*one)}, "pc3"));
+  peers->set_configured({at(*two)});
+  wait([&] { return two->connections() == 1; });
+  run_without_timers();
+  const auto hosts = peers->report().hosts();
+  EXPECT_TRUE(std::any_of(hosts.begin(), hosts.end(), [&](const local::Host& each) {
+    return each.error().find("is announced at '" + at(*one).str() + "', where host") !=
+           std::string::npos;
+  }));
+}
+
 // --- the first words
 
 TEST_F(FoundHostsTest, AreWaitedForWhileMdnsWorks) {
