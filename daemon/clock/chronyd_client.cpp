@@ -30,7 +30,8 @@ void ChronydClient::poll_if_due() {
 }
 
 void ChronydClient::poll_now() {
-  if (!question_ && loop_.now() - asked_ >= kMinPause) next_question();
+  // From the timer, because this may be called from the callback of the last answer's socket.
+  if (!question_ && loop_.now() - asked_ >= kMinPause) timer_.enable_in(Duration::zero());
 }
 
 void ChronydClient::next_question() {
