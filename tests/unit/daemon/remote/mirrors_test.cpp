@@ -222,12 +222,15 @@ TEST_F(MirrorsTest, DoesNotLetThoseWaitForHistoryWhoDidNotAskForIt) {
   streams->find(kOdometry)->want_history(true);
   serve(10);
   EXPECT_FALSE(open_without()->has_value()) << "there is no sample yet";
-  samples(10, 10);
-  run_until(loop, [&] { return find() && newest(*find()) == 10; });
+  owner->send_sample({10, {}, {}}, Bytes(24), true);
+  run_turns(loop, 300);
+  EXPECT_FALSE(open_without()->has_value()) << "it was overwritten while it was sent";
+  samples(11, 11);
+  run_until(loop, [&] { return find() && newest(*find()) == 11; });
   EXPECT_EQ(state().state(), proto::Mirror::FILLING);
   const auto at_once = open_without();
   ASSERT_TRUE(at_once->has_value());
-  EXPECT_EQ(newest(*at_once->value().value().stream), 10);
+  EXPECT_EQ(newest(*at_once->value().value().stream), 11);
   EXPECT_FALSE(recorder->has_value()) << "the history is still on its way";
   owner->send_caught_up();
   wait(recorder);
