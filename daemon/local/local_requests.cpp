@@ -262,7 +262,10 @@ Reply LocalRequests::get_daemon(const Client& client) const {
 // --- other hosts
 
 std::optional<StreamId> LocalRequests::asked_untrusted(const local::Request& request) const {
-  if (request.has_ping_host()) return StreamId{"", 0, request.ping_host().host()};
+  if (request.has_ping_host()) {
+    const std::string& host = request.ping_host().host();
+    return host == registry_.host() ? std::nullopt : std::optional(StreamId{"", 0, host});
+  }
   const proto::StreamId* named = subject(request);
   if (!named) return std::nullopt;
   const Result<StreamId> id = wire::stream_id_untrusted(*named);

@@ -499,12 +499,12 @@ void LocalService::broadcast(const proto::StreamEvent& event) {
   local::Response response;
   *response.mutable_stream_event() = event;
   const StreamId id = id_of(event);
-  if (event.property_set()) {
-    clear_property_news(id);
-    properties_[id.str()] = end_of_news();
-  }
-  news_.push_back({id, event.removed(), wire::encode_frame(response)});
+  News news{id, event.removed(), wire::encode_frame(response)};
+  if (event.property_set()) clear_property_news(id);
+  news_.push_back(std::move(news));
   news_bytes_ += sizeof(News) + news_.back().frame.size();
+  // Last: without memory for it, the event just stays when the property is set again.
+  if (event.property_set()) properties_[id.str()] = end_of_news() - 1;
   // The others have more to get already, and their turn comes.
   for (const ClientNumber number : std::exchange(informed_, {})) {
     clients_.at(number).output->request_turn();
