@@ -353,13 +353,21 @@ class FoxgloveConnection : public Connection {
     OpenStream* const stream = clients_.streams_.find(channel.stream).stream;
     if (!stream) return nullptr;
     auto& reader = std::get<RawReader>(stream->reader);
-    return reader.incarnation() == channel.incarnation ? &reader : nullptr;
+    return is_of(channel, reader) ? &reader : nullptr;
+  }
+
+  // Whether the channel was made for what is read now: else the next state brings a new one. What
+  // another host lists of a stream and what it then sends need not agree.
+  static bool is_of(const FoxgloveClients::Channel& channel, const RawReader& reader) {
+    return reader.incarnation() == channel.incarnation &&
+           reader.payload_bytes() == channel.type.payload_bytes;
   }
 
   void leave_out_before(Subscription& subscription, Tid tid) {
     if (tid <= subscription.next) return;
     left_out_ += static_cast<std::uint64_t>(tid - subscription.next);
     subscription.next = tid;
+    subscription.arriving_since.reset();
   }
 
   // Of each subscription the samples after the last one sent, until `until`, or until there are
@@ -509,9 +517,9 @@ class FoxgloveConnection : public Connection {
     if (subscription.incarnation != reader.incarnation()) {
       subscription.incarnation = reader.incarnation();
       subscription.next = kNoTid;
+      subscription.arriving_since.reset();
     }
-    // Its channel was made for another type; the next state brings a new channel.
-    if (reader.incarnation() != channel->second.incarnation) return;
+    if (!is_of(channel->second, reader)) return;
     const Tid newest = reader.newest_tid();
     if (newest == kNoTid) return;
     if (subscription.next == kNoTid) subscription.next = newest;

@@ -22,11 +22,12 @@ std::optional<Time> guessed_oldest(const StreamInfo& stream) {
   if (stream.newest == kNoTid) return std::nullopt;
   const double cycle_s =
       stream.rate_hz > 0 ? 1 / stream.rate_hz : std::chrono::duration<double>(stream.cycle).count();
-  const double length_s = static_cast<double>(stream.newest - stream.oldest) * cycle_s;
+  // Another host may report any numbers.
+  const double samples = static_cast<double>(stream.newest) - static_cast<double>(stream.oldest);
   constexpr double kMaxSeconds = 1e9;
-  return ctl::saturating_add(
-      stream.newest_time,
-      -Duration(static_cast<std::int64_t>(std::min(length_s, kMaxSeconds) * 1e9)));
+  const double length_s = std::clamp(samples * cycle_s, 0.0, kMaxSeconds);
+  return ctl::saturating_add(stream.newest_time,
+                             -Duration(static_cast<std::int64_t>(length_s * 1e9)));
 }
 
 void extend(std::optional<TimeRange>& range, Time first, Time last) {
