@@ -7,9 +7,8 @@
 #include <algorithm>
 
 namespace dssm::ctl {
-namespace {
 
-bool is_named(const StreamId& id, const std::string& pattern) {
+bool fits_pattern(const StreamId& id, const std::string& pattern) {
   const auto fits = [&](const std::string& text) {
     return ::fnmatch(pattern.c_str(), text.c_str(), 0) == 0;
   };
@@ -22,8 +21,6 @@ bool is_named(const StreamId& id, const std::string& pattern) {
   }
   return fits(id.name) || (has_id && fits(with_id));
 }
-
-}  // namespace
 
 std::vector<std::string> opening_names(const std::vector<StreamInfo>& streams,
                                        std::string_view own_host) {
@@ -51,15 +48,11 @@ bool StreamFilter::takes(const StreamId& id) const {
   }
   return patterns_.empty() ||
          std::any_of(patterns_.begin(), patterns_.end(),
-                     [&](const std::string& pattern) { return is_named(id, pattern); });
+                     [&](const std::string& pattern) { return fits_pattern(id, pattern); });
 }
 
-std::vector<std::string> StreamFilter::unused_patterns(const std::vector<StreamId>& ids) const {
-  std::vector<std::string> unused = patterns_;
-  std::erase_if(unused, [&](const std::string& pattern) {
-    return std::ranges::any_of(ids, [&](const StreamId& id) { return is_named(id, pattern); });
-  });
-  return unused;
+std::vector<std::string> StreamFilter::patterns() const {
+  return patterns_.empty() ? std::vector<std::string>{"*"} : patterns_;
 }
 
 std::string pattern_of(const std::string& name) {

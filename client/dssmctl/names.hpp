@@ -47,6 +47,9 @@ class Duplicates {
 // A pattern for StreamFilter that only this full name fits.
 std::string pattern_of(const std::string& name);
 
+// Whether a stream fits a pattern, as StreamFilter takes them.
+bool fits_pattern(const StreamId& id, const std::string& pattern);
+
 // Which streams are listed or recorded.
 class StreamFilter {
  public:
@@ -57,8 +60,8 @@ class StreamFilter {
       : hosts_(std::move(hosts)), patterns_(std::move(patterns)) {}
 
   bool takes(const StreamId& id) const;
-  // The patterns that none of `ids` fits.
-  std::vector<std::string> unused_patterns(const std::vector<StreamId>& ids) const;
+  // The patterns; one that all names fit if there are none.
+  std::vector<std::string> patterns() const;
 
  private:
   std::vector<std::string> hosts_, patterns_;

@@ -110,13 +110,11 @@ class RecordingRun {
 
   void report() {
     report_notices();
-    if (may_have_opened()) report_unused();
+    if (MonoClock::now() - started_ > kFirstNoticeTime) report_unused();
     if (options_.json) return;
     out_.redraw_line(
         [&] { return fmt::format("{}: {}", escaped(file_.string()), progress_text(recorder_)); });
   }
-
-  bool may_have_opened() const { return MonoClock::now() - started_ > kFirstNoticeTime; }
 
   void report_notices() {
     for (const std::string& text : recorder_.take_notices()) notice(text);
@@ -127,11 +125,9 @@ class RecordingRun {
   void report_unused() {
     if (std::exchange(has_named_unused_, true)) return;
     const std::vector<std::string> unused = recorder_.unused_patterns();
-    if (!unused.empty()) {
-      notice(fmt::format("no stream fits {} so far", list_text(unused)));
-    } else if (recorder_.streams() == 0 && may_have_opened()) {
-      notice("no stream fits; what comes is recorded");
-    }
+    if (unused.empty()) return;
+    notice(options_.patterns.empty() ? "no stream fits so far"
+                                     : fmt::format("no stream fits {} so far", list_text(unused)));
   }
 
   void report_undescribed() {

@@ -58,7 +58,10 @@ Time Recorder::past_of(const Source& source, Time now, Duration past) {
 }
 
 Recorder::Opener::Opener(Session session, RecorderPlan plan)
-    : session_(std::move(session)), plan_(std::move(plan)), started_(WallClock::now()) {}
+    : session_(std::move(session)),
+      plan_(std::move(plan)),
+      started_(WallClock::now()),
+      unused_patterns_(plan_.filter.patterns()) {}
 
 void Recorder::Opener::end() {
   watch_.reset();
@@ -96,6 +99,9 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
   std::optional<std::uint64_t> replaced_incarnation;
   bool is_other_type = false;  // than its reader can continue with
   if (event.kind == StreamEvent::Kind::added && wants(event.stream)) {
+    std::erase_if(unused_patterns_, [&](const std::string& pattern) {
+      return fits_pattern(event.stream.id, pattern);
+    });
     const auto known = known_.find(name);
     if (event.property_set) {
       want_property({event.stream, event.property_after, MonoClock::now()});
@@ -284,6 +290,13 @@ void Recorder::Opener::run() {
         entry = wanted_.end();
       }
     }
+    // The network has yet to bring what the ring before this one had.
+    if (opened && entry != wanted_.end() && incarnation != 0 &&
+        opened->reader.incarnation() == entry->replaced_incarnation) {
+      entry->is_opening = false;
+      entry->due = deadline_in(kReopenPeriod);
+      continue;
+    }
     const bool is_wanted = entry != wanted_.end();
     if (is_wanted && entry->from_start && !entry->reported) --untried_;
     const bool is_missed =
@@ -322,7 +335,7 @@ Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
   RawReader reader = DSSM_TRY(
       session.open_raw_reader(wanted.stream.id, nullptr, 0,
                               with_history ? FetchHistory::at_once : FetchHistory::when_read));
-  Source source{std::move(reader), 0, kNoTid, kNoTid, {}, {}, true, {}, {}};
+  Source source{std::move(reader)};
   if (property) source.property = *std::move(property);
   const Tid newest = source.reader.newest_tid();
   // The stamps of a recording that is being played are of another time than now. What lists say of
@@ -347,6 +360,8 @@ Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
     if (plan_.range) {
       source.from = plan_.range->first;
       source.until = plan_.range->last;
+      SampleInfo info;
+      if (source.reader.find(*source.until, info) == ReadStatus::ok) source.last_wanted = info.tid;
     }
     if (source.from) skip_to(source.reader, *source.from);
     // What is there now counts, also if it is overwritten before it is read; of a new ring all.
@@ -391,11 +406,9 @@ bool Recorder::Opener::has_tried_all() const {
   return untried_ == 0 && opened_.empty();
 }
 
-std::vector<std::string> Recorder::Opener::unused_patterns(std::vector<StreamId> ids) const {
+std::vector<std::string> Recorder::Opener::unused_patterns() const {
   const std::lock_guard lock(mutex_);
-  for (const Wanted& wanted : wanted_) ids.push_back(wanted.stream.id);
-  for (const Source& source : opened_) ids.push_back(source.reader.id());
-  return plan_.filter.unused_patterns(ids);
+  return unused_patterns_;
 }
 
 // --- recording
@@ -729,6 +742,9 @@ Result<bool> Recorder::take_next(Turn& turn) {
   turn.bytes += payload_.size();
   ++turn.samples;
   if ((source.from && info.time < *source.from) || (source.until && info.time > *source.until)) {
+    if (source.next != kNoTid) {
+      DSSM_TRY(add_gap(source, std::min(info.tid, source.last_wanted + 1)));
+    }
     source.next = info.tid + 1;
     return true;
   }
@@ -736,16 +752,20 @@ Result<bool> Recorder::take_next(Turn& turn) {
   return true;
 }
 
+// Those that were wanted and not read, before sample `end`.
+Result<void> Recorder::add_gap(const Source& source, Tid end) {
+  if (end <= source.next) return {};
+  return file_->add_gap(source.number, source.next, static_cast<std::uint64_t>(end - source.next));
+}
+
 Result<void> Recorder::write(Source& source, const SampleInfo& info) {
-  if (source.next != kNoTid && info.tid > source.next) {
-    DSSM_TRY(file_->add_gap(source.number, source.next,
-                            static_cast<std::uint64_t>(info.tid - source.next)));
-  }
+  if (source.next != kNoTid) DSSM_TRY(add_gap(source, info.tid));
   source.next = info.tid + 1;
+  DSSM_TRY(file_->write(source.number, info, source.reader.clock_error(info),
+                        std::span(payload_).first(info.payload_bytes)));
   newest_tids_[source.number] = info.tid;
   newest_time_ = std::max(newest_time_, info.time);
-  return file_->write(source.number, info, source.reader.clock_error(info),
-                      std::span(payload_).first(info.payload_bytes));
+  return {};
 }
 
 bool Recorder::is_past_late() {
@@ -774,12 +794,6 @@ std::vector<std::string> Recorder::streams_without_fields() const {
     if (!file_->has_fields(source.number)) names.push_back(source.reader.id().str());
   }
   return names;
-}
-
-std::vector<std::string> Recorder::unused_patterns() const {
-  std::vector<StreamId> ids;
-  for (const Source& source : sources_) ids.push_back(source.reader.id());
-  return opener_.unused_patterns(std::move(ids));
 }
 
 std::vector<std::string> Recorder::take_notices() { return opener_.take_notices(); }

@@ -84,8 +84,8 @@ class Recorder {
   bool is_past_late();
 
   std::size_t streams() const { return sources_.size(); }
-  // The plan's patterns that no stream fits, of those that are recorded or could not be opened yet.
-  std::vector<std::string> unused_patterns() const;
+  // The plan's patterns that no stream has fitted; "*" if it has none, and no stream was wanted.
+  std::vector<std::string> unused_patterns() const { return opener_.unused_patterns(); }
   // Those of which the file has only bytes: they were not described.
   std::vector<std::string> streams_without_fields() const;
   // Of the file, or of the last one; there was one.
@@ -105,6 +105,7 @@ class Recorder {
   static constexpr Duration kMinPeriod = std::chrono::milliseconds(1);
   static constexpr Duration kMaxPeriod = std::chrono::milliseconds(50);
   static constexpr Duration kRetryPeriod = std::chrono::seconds(1);
+  static constexpr Duration kReopenPeriod = std::chrono::milliseconds(50);
   static constexpr Duration kEndingTime = std::chrono::seconds(1);
   // So long the past waits for streams to be opened.
   static constexpr Duration kOpeningTime = std::chrono::seconds(1);
@@ -143,6 +144,7 @@ class Recorder {
     Tid next = kNoTid;  // what was before it is recorded, or known as lost; kNoTid: not known yet
     Tid past_until = kNoTid;          // the newest at its opening, if history is wanted
     std::optional<Time> from, until;  // samples before and after these are not wanted
+    Tid last_wanted = kNoTid;         // with `until`: of those that there were when it was opened
     bool is_of_now = true;            // its stamps are of this time, and not of one that is played
     std::vector<std::byte> property;  // that the file has, or gets at its beginning
     std::vector<NewProperty> new_properties;  // the file has not yet
@@ -178,8 +180,7 @@ class Recorder {
     std::vector<StreamId> take_described();
     std::vector<std::string> take_notices();
     bool has_tried_all() const;  // of the streams that there were at begin()
-    // Those that none of `ids` fits, and none that is still to be opened.
-    std::vector<std::string> unused_patterns(std::vector<StreamId> ids) const;
+    std::vector<std::string> unused_patterns() const;
 
    private:
     struct Wanted {
@@ -221,6 +222,7 @@ class Recorder {
     mutable std::mutex mutex_;
     std::condition_variable changed_;
     bool is_beginning_ = true;  // begin() runs: what comes is there already
+    std::vector<std::string> unused_patterns_;
     std::vector<Wanted> wanted_;
     std::map<std::string, Known> known_;                  // by name
     std::vector<std::pair<StreamId, MonoTime>> removed_;  // of these, and when
@@ -284,6 +286,7 @@ class Recorder {
   // Those whose time is known.
   //   all  the others, too
   Result<void> write_properties(Source& source, bool all);
+  Result<void> add_gap(const Source& source, Tid end);
   Result<void> write(Source& source, const SampleInfo& info);
   // Takes what there is until now and completes the file.
   Result<void> complete();

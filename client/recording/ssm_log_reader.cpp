@@ -32,6 +32,23 @@ RecordedStream stream_of_log(const SsmLogHead& head, std::string_view line) {
   return stream;
 }
 
+// Of records [first, end) those that are no samples.
+void add_gaps(std::vector<RecordedGap>& gaps, const std::vector<Message>& samples, Tid first,
+              Tid end) {
+  const auto add = [&](Tid next) {
+    if (next == first) return;
+    const auto count = static_cast<std::uint64_t>(next - first);
+    const bool continues =
+        !gaps.empty() && gaps.back().first + static_cast<Tid>(gaps.back().count) == first;
+    continues ? void(gaps.back().count += count) : gaps.push_back({first, count});
+  };
+  for (const Message& sample : samples) {
+    add(sample.tid);
+    first = sample.tid + 1;
+  }
+  add(end);
+}
+
 }  // namespace
 
 Result<void> FileReader::begin_log(std::string_view begin) {
@@ -74,6 +91,8 @@ void FileReader::scan_log() {
     decode_records(loaded, chunk);
     const std::uint64_t samples = loaded.messages.size();
     left_out += chunk.index.length / record_bytes - samples;
+    add_gaps(channels_[kChannel].gaps, loaded.messages, static_cast<Tid>(first),
+             static_cast<Tid>(first + chunk.index.length / record_bytes));
     for (const Message& message : loaded.messages) {
       double seconds = 0;
       std::memcpy(&seconds, loaded.data.data() + message.offset - sizeof seconds, sizeof seconds);

@@ -241,7 +241,9 @@ TEST_F(Convert, KeepsWhatWasLost) {
     const std::uint32_t number = writer.add_stream(stream).value();
     ASSERT_TRUE(writer.add_gap(number, first, 2));
     for (const Tid tid : {first + 2, first + 6}) {
-      if (tid == first + 6) ASSERT_TRUE(writer.add_gap(number, first + 3, 3));
+      if (tid == first + 6) {
+        ASSERT_TRUE(writer.add_gap(number, first + 3, 3));
+      }
       ASSERT_TRUE(writer.write(number, {tid, time_from_ns(tid), 0ns, 8}, 0ns, payload));
     }
     ASSERT_TRUE(writer.add_gap(number, first + 7, 1));

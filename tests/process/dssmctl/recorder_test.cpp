@@ -131,6 +131,25 @@ TEST_F(RecorderOf, ThePastLosesWhatItsRingOverwroteAfterItWasOpened) {
   finish_and_count(1000);
 }
 
+TEST_F(RecorderOf, ARangeLosesWhatItsRingOverwroteAfterItWasOpened) {
+  RawWriter writer = replace<double>(0, 8);
+  const double value = 0;
+  const auto write = [&](std::int64_t i) {
+    writer.write(std::as_bytes(std::span(&value, 1)), at_ns(i * kSecond));
+  };
+  for (int i = 0; i < 8; ++i) write(i);
+  ctl::RecorderPlan plan{ctl::StreamFilter({}, {}), {}, {}, {}, false};
+  plan.range = {at_ns(3 * kSecond), at_ns(6 * kSecond)};
+  recorder_ =
+      ctl::Recorder::start(session_with(daemon_), RecordingWriter::create(file_).value(), plan)
+          .value();
+  await_opened(writer.id());
+  for (int i = 8; i < 30; ++i) write(i);
+  ASSERT_TRUE(recorder_->finish());
+  EXPECT_EQ(recorder_->progress().samples, 0U);
+  EXPECT_EQ(recorder_->progress().lost_samples, 4U);
+}
+
 // Its reader could have continued with any type of that size before it got a name.
 TEST_F(RecorderOf, AStreamThatGotANameForItsTypeIsOpenedAgainForAnother) {
   RawWriter writer =

@@ -60,8 +60,8 @@ TEST(StreamFilter, TakesStreamsOfTheGivenHostsOnly) {
   EXPECT_FALSE(filter.takes({"lidar", 0, "pc1"}));
   EXPECT_FALSE(filter.takes({"odom", 0, "pc2"}));
   EXPECT_TRUE(StreamFilter({}, {}).takes({"odom", 0, "pc2"}));
-  EXPECT_EQ(filter.unused_patterns({{"odom", 0, "pc2"}, {"lidar", 3, "pc3"}}),
-            std::vector<std::string>{"c*"});
+  EXPECT_EQ(filter.patterns(), (std::vector<std::string>{"c*", "l*"}));
+  EXPECT_EQ(StreamFilter({}, {}).patterns(), std::vector<std::string>{"*"});
 }
 
 TEST(PatternOf, FitsThatStreamOnly) {

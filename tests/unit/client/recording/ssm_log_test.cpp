@@ -150,6 +150,7 @@ TEST_F(SsmLogs, ThatAreDamagedAreReadAsFarAsPossible) {
   ASSERT_TRUE(odd) << odd.error().message;
   EXPECT_EQ(odd->streams()[0].samples, 3U);
   EXPECT_EQ(odd->streams()[0].lost_samples, 3U);
+  EXPECT_EQ(odd->streams()[0].gaps, (std::vector<RecordedGap>{{0, 1}, {2, 1}, {4, 1}}));
   EXPECT_THAT(odd->warnings(), ElementsAre(HasSubstr("3 records are left out"),
                                            HasSubstr("1 times are rounded to a nanosecond")));
   RecordingCursor cursor = odd->cursor();
