@@ -51,7 +51,9 @@ void Dialer::restart(const Error& why) {
       if (!connection_->is_open()) return;  // on_closed() follows
       reason_ = why;
       given_up_ = true;
-      if (loop_.now() - connection_->last_heard() >= wire::kPeerTimeout) {
+      // A channel may have been heard a little later than the control connection, whose timeout
+      // ends it.
+      if (loop_.now() - connection_->last_heard() >= wire::kPeerTimeout / 2) {
         connection_->discard_output_at_close();
       }
       return connection_->close_with(why);
