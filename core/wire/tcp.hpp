@@ -55,8 +55,8 @@ Result<void> finish_connect(int socket, const SocketAddress& address);
 // Sets the options of the accepted end.
 void set_channel_options(int socket) noexcept;
 
-// When the socket is closed, what waits to be sent is given up: else the kernel tries for up to 30 s
-// to send it, and looks for a host that is not there.
+// When the socket is closed, what waits to be sent is given up. Else the kernel tries to send it
+// for up to 30 s, and looks for a host that is not there.
 void discard_output_at_close(int socket) noexcept;
 
 // The transport over a connected or accepted socket, for both ends of a connection; for the
