@@ -188,7 +188,10 @@ Result<RawReader> Session::await_raw_reader(const StreamId& id, MonoTime deadlin
         // When an event arrives is not the same each time, the playback time is.
         lock.unlock();
         const auto never = [] { return false; };
-        const auto slept = lockstep->wait_until(std::min(deadline, now + kLockstepPause), never);
+        // Nor is how long this thread takes until it waits.
+        const auto slept = deadline - now > kLockstepPause
+                               ? lockstep->wait_for(kLockstepPause, never)
+                               : lockstep->wait_until(deadline, never);
         lock.lock();
         if (slept) break;
       }

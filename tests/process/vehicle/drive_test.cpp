@@ -20,6 +20,7 @@
 #include "docs/examples/vehicle/map_picture.hpp"
 #include "docs/examples/vehicle/occupancy_grid.hpp"
 #include "docs/examples/vehicle/resample.hpp"
+#include "tests/support/await.hpp"
 
 namespace vehicle {
 namespace {
@@ -109,6 +110,38 @@ TEST_F(VehicleDrive, GivesTheSameMapWhenTheReadersStartAfterTheDrive) {
   }
   ASSERT_TRUE(write_png(draw_map(grid, way), dir_ + "/expected.png"));
   EXPECT_EQ(content(map_), content(dir_ + "/expected.png"));
+}
+
+TEST_F(VehicleDrive, GivesTheSameMapEachTimeItIsReplayedInLockstep) {
+  const std::string dssmctl = dssm::test::built("client/dssmctl/dssmctl");
+  const std::string drive = dir_ + "/drive.mcap", again = dir_ + "/again.png";
+  {
+    const DaemonProcess daemon;
+    const pid_t recorder = dssm::test::start({dssmctl, "record", "odometry", "lidar", "-o", drive},
+                                             {daemon.environment()});
+    run_all(daemon, {source("encoder"), source("lidar"), localizer(), mapper(map_)});
+    // It has the past, too, of streams that it finds.
+    dssm::Session session = connect(daemon);
+    for (const char* name : {"odometry", "lidar"}) {
+      dssm::test::await([&] {
+        return session.stream_info(dssm::StreamId{name, 0, ""}).value().readers == 1;
+      });
+    }
+    ::kill(recorder, SIGINT);
+    EXPECT_EQ(dssm::test::wait_for(recorder), 0);
+  }
+  for (int round = 0; round < 2; ++round) {
+    const DaemonProcess daemon;
+    const std::string mapping = program("mapper", {}).front() + " --out " + again;
+    const dssm::test::Finished played =
+        dssm::test::run({dssmctl, "play", drive, "--lockstep", program("localizer", {}).front(),
+                         "--lockstep", mapping},
+                        {daemon.environment()});
+    ASSERT_EQ(played.exit_status, 0) << played.err;
+    EXPECT_EQ(written(daemon, "pose"), std::ssize(scans()) + 1);
+    EXPECT_EQ(content(again), content(map_)) << "round " << round;
+    dssm::test::remove_tree(again);
+  }
 }
 
 TEST_F(VehicleDrive, DrawsAPictureWithWallsFloorAndPath) {
