@@ -61,12 +61,14 @@ class MemoryLimit {
   pid_t pid_;
   rlimit before_{};
 };
-// Sanitizers need memory themselves, and keep for a while what was freed.
+// With a sanitizer programs are slow; what shows nothing more there is left to other builds.
 #if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
-inline constexpr bool kMemoryIsMeasurable = false;
+inline constexpr bool kIsSanitized = true;
 #else
-inline constexpr bool kMemoryIsMeasurable = true;
+inline constexpr bool kIsSanitized = false;
 #endif
+// Sanitizers need memory themselves, and keep for a while what was freed.
+inline constexpr bool kMemoryIsMeasurable = !kIsSanitized;
 
 // For a dssmd that is killed while programs wait to recreate its streams: on a machine where many
 // tests run at once, programs need more than the default of 500 ms to offer their rings.
