@@ -518,7 +518,7 @@ std::size_t count_of(const std::string& folder) {
 }
 
 TEST_F(Api, LeaksNothingIn10000OpensAndCloses) {
-  constexpr int kTimes = kIsSanitized ? 1000 : 10'000;
+  constexpr int kTimes = test::kIsSanitized ? 1000 : 10'000;
   auto writer = make();
   const auto files_of = [&](pid_t pid) { return "/proc/" + std::to_string(pid) + "/fd"; };
   const auto once = [&] {
