@@ -517,7 +517,6 @@ void FileReader::add_metadata(const MetadataIndex& about, std::span<const std::b
       if (channel.channel.topic == entry("topic") && channel.stream &&
           incarnation != channel.channel.metadata.end() &&
           incarnation->second == entry("incarnation")) {
-        for (const RecordedGap& gap : gaps) channel.lost_samples += gap.count;
         channel.gaps.insert(channel.gaps.end(), gaps.begin(), gaps.end());
       }
     }

@@ -77,12 +77,11 @@ struct FileChannel {
   Channel channel;
   std::optional<RecordedStream> stream;  // with its last property; nullopt: of another program
   std::vector<PropertyPlace> properties;
-  bool is_left_out = false;  // no stream can be made of it
-  std::vector<RecordedGap> gaps;
-  std::uint64_t lost_samples = 0;  // of gaps, and records of a log that are left out
-  std::uint64_t max_bytes = 0;     // of a message, of another program's channel
-  std::uint64_t messages = 0;      // of another program's channel: they are counted
-  Tid last_tid = kNoTid;           // of our channel
+  bool is_left_out = false;       // no stream can be made of it
+  std::vector<RecordedGap> gaps;  // of a log: records that are left out
+  std::uint64_t max_bytes = 0;    // of a message, of another program's channel
+  std::uint64_t messages = 0;     // of another program's channel: they are counted
+  Tid last_tid = kNoTid;          // of our channel
 };
 
 class FileReader {

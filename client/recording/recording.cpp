@@ -153,7 +153,7 @@ Result<void> Content::add(std::uint32_t number) {
       known->type.payload_bytes = std::max(known->type.payload_bytes, about.type.payload_bytes);
     }
     add_properties(at, number, channel);
-    streams[at].lost_samples += channel.lost_samples;
+    for (const RecordedGap& gap : channel.gaps) streams[at].lost_samples += gap.count;
     streams[at].gaps.insert(streams[at].gaps.end(), channel.gaps.begin(), channel.gaps.end());
   }
 

@@ -103,7 +103,6 @@ void FileReader::scan_log() {
     summary_.chunks.push_back(std::move(chunk));
   }
   if (left_out > 0) {
-    channels_[kChannel].lost_samples = left_out;
     warn(fmt::format("{} records are left out: their times are not between the years 1678 and 2261",
                      left_out));
   }

@@ -285,7 +285,8 @@ std::string interface_without_carrier(const SocketAddress& address) {
   if (!local) return {};
   const std::optional<IpAddress> own = IpAddress::of(*local);
   ifaddrs* all = nullptr;
-  if (!own || ::getifaddrs(&all)) return {};
+  // What this PC sends to itself takes no interface with a cable.
+  if (!own || own == IpAddress::of(address) || ::getifaddrs(&all)) return {};
   std::string without;
   for (const ifaddrs* each = all; each; each = each->ifa_next) {
     if (!each->ifa_addr) continue;
