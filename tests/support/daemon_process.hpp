@@ -11,6 +11,8 @@
 #include <utility>
 #include <vector>
 
+#include "tests/support/sanitized.hpp"
+
 namespace dssm::test {
 
 // The path of a built file, e.g. built("daemon/dssmd"); from $DSSM_BUILD_ROOT, which meson
@@ -61,12 +63,6 @@ class MemoryLimit {
   pid_t pid_;
   rlimit before_{};
 };
-// With a sanitizer programs are slow; what shows nothing more there is left to other builds.
-#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
-inline constexpr bool kIsSanitized = true;
-#else
-inline constexpr bool kIsSanitized = false;
-#endif
 // Sanitizers need memory themselves, and keep for a while what was freed.
 inline constexpr bool kMemoryIsMeasurable = !kIsSanitized;
 

@@ -10,6 +10,7 @@
 #include <random>
 
 #include "tests/process/daemon/raw_client.hpp"
+#include "tests/support/sanitized.hpp"
 
 namespace dssm::test {
 namespace {
@@ -48,7 +49,7 @@ TEST(KilledClient, LeavesNothingInDssmdWheneverItIsKilled) {
   const auto seed = std::random_device()();
   SCOPED_TRACE("seed " + std::to_string(seed));
   std::mt19937 random(seed);
-  for (int round = 0; round < 60; ++round) {
+  for (int round = 0; round < (kIsSanitized ? 15 : 60); ++round) {
     std::vector<pid_t> children;
     for (std::size_t i = 0; i < 4; ++i) {
       const pid_t child = ::fork();

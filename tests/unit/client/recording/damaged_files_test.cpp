@@ -9,6 +9,7 @@
 
 #include "client/recording/records.hpp"
 #include "tests/support/await.hpp"
+#include "tests/support/sanitized.hpp"
 #include "tests/unit/client/recording/recordings.hpp"
 
 namespace dssm::test {
@@ -47,11 +48,7 @@ class DamagedFiles : public RecordingTest {
 };
 
 // Sanitizers make each opening slow.
-#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
-constexpr std::size_t kCutStep = 7;
-#else
-constexpr std::size_t kCutStep = 1;
-#endif
+constexpr std::size_t kCutStep = kIsSanitized ? 37 : 1;
 
 TEST_F(DamagedFiles, CutAtAnyByteLoseOnlyTheOpenChunk) {
   for (const Compression compression : {Compression::none, Compression::lz4, Compression::zstd}) {
@@ -142,7 +139,7 @@ TEST_F(DamagedFiles, NeverReturnAWrongSample) {
   const std::vector<Recorded> written = make(path("whole.mcap"), Compression::zstd);
   const std::string whole = content_of(path("whole.mcap"));
   std::mt19937 random(20);
-  for (int i = 0; i < 3000; ++i) {
+  for (int i = 0; i < (test::kIsSanitized ? 600 : 3000); ++i) {
     std::string content = whole;
     for (std::size_t n = random() % 4 + 1; n > 0; --n) {
       content[random() % content.size()] = static_cast<char>(random());

@@ -7,6 +7,7 @@
 #include <cstdlib>
 #include <dssm/describe.hpp>
 
+#include "tests/support/sanitized.hpp"
 #include "tests/unit/client/recording/recordings.hpp"
 
 namespace dssm::test {
@@ -40,11 +41,7 @@ std::string output_of(const std::string& command, int& status) {
 }
 
 // How often a recording is cut off. Sanitizers make each opening slow.
-#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
-constexpr int kCuts = 1000;
-#else
-constexpr int kCuts = 10'000;
-#endif
+constexpr int kCuts = kIsSanitized ? 200 : 10'000;
 
 constexpr Compression kCompressions[] = {Compression::none, Compression::lz4, Compression::zstd};
 

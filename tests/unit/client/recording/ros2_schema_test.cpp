@@ -15,6 +15,8 @@
 #include <vector>
 #ifdef DSSM_HAS_FASTCDR
 #include <fastcdr/Cdr.h>
+
+#include "tests/support/sanitized.hpp"
 #endif
 
 namespace dssm::recording {
@@ -194,7 +196,7 @@ TEST(Ros2Schema, FindsEachNumberOfRandomTypesWhereItIs) {
   std::mt19937 random(20);
   const char* const names[] = {"a", "b", "a.b", "a.c", "a.b.d", "X", "f_", "a[0].e", "a[1].e", "1"};
   std::size_t found_numbers = 0;
-  for (int i = 0; i < 5000; ++i) {
+  for (int i = 0; i < (test::kIsSanitized ? 1000 : 5000); ++i) {
     TypeInfo type{"Random type", 200, 8, {}};
     std::set<std::pair<std::uint64_t, std::uint64_t>> numbers;
     for (std::size_t n = random() % 8 + 1; n > 0; --n) {

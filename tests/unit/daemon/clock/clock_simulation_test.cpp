@@ -9,6 +9,8 @@
 
 #include <cstdlib>
 
+#include "tests/support/sanitized.hpp"
+
 namespace dssm::clock {
 namespace {
 
@@ -18,11 +20,7 @@ using Traits = SimulatedPc::Traits;
 constexpr ClockEstimator::Settings kFiftyPpm{Duration(1500us), 50'000};
 constexpr int kRuns = 20;
 // Of what must hold: under a sanitizer, where all is slower, the code matters more than the clock.
-#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
-constexpr int kCoveredRuns = 5;
-#else
-constexpr int kCoveredRuns = kRuns;
-#endif
+constexpr int kCoveredRuns = test::kIsSanitized ? 2 : kRuns;
 
 // The same in each run, so that what fails here fails again; DSSM_TEST_SEED tries others.
 std::uint32_t first_seed() {

@@ -11,6 +11,7 @@
 #include <random>
 
 #include "daemon/clock/clock_distance.hpp"
+#include "tests/support/sanitized.hpp"
 
 namespace dssm::clock {
 namespace {
@@ -155,7 +156,7 @@ TEST_F(PairMeasurementTest, TheRateMayChangeByAllThatIsAllowed) {
   theirs.rate = 40e-6;
   least_ns = 100;
   double change = 0;  // of the rate, in a second
-  for (int i = 0; i < 4000; ++i) {
+  for (int i = 0; i < (test::kIsSanitized ? 1000 : 4000); ++i) {
     if (i % 50 == 0)
       change = 1e-9 * PairMeasurement::kMaxRateChange * (uniform(0, 1) < 0.5 ? -1 : 1);
     beat(i % 2 == 0 ? 0 : 1e5);
@@ -172,7 +173,7 @@ TEST_F(PairMeasurementTest, TheRateMayChangeByAllThatIsAllowed) {
 TEST_F(PairMeasurementTest, TheBoundsAreAsTightAsTheBestRoundTrips) {
   theirs.rate = 35e-6;
   ours.rate = -20e-6;
-  constexpr int kSeconds = 2000;
+  constexpr int kSeconds = test::kIsSanitized ? 500 : 2000;
   int tight = 0;
   for (int i = 0; i < 64 + kSeconds; ++i) {
     beat();

@@ -10,6 +10,7 @@
 #include <set>
 
 #include "tests/support/memory_peer.hpp"
+#include "tests/support/sanitized.hpp"
 #include "tests/unit/core/ring/test_ring.hpp"
 #include "tests/unit/daemon/run_loop.hpp"
 
@@ -1138,7 +1139,7 @@ TEST_F(NewestFirst, LargeBacklogComesNewestFirst) {
 
 // A writer, a network and a receiver that do anything.
 TEST_F(SmallBacklog, EachSampleIsSentOrLostOnce) {
-  for (unsigned seed = 0; seed < 48; ++seed) {
+  for (unsigned seed = 0; seed < (test::kIsSanitized ? 16 : 48); ++seed) {
     std::mt19937 random(seed);
     const auto up_to = [&](int most) { return std::uniform_int_distribution(0, most)(random); };
     const int many = seed % 8 ? 1 : 64;  // of tiny ones a turn is shorter than 64 KiB

@@ -8,6 +8,7 @@
 #include "daemon/link/sample_pump.hpp"
 #include "daemon/remote/mirror_ring.hpp"
 #include "tests/support/memory_peer.hpp"
+#include "tests/support/sanitized.hpp"
 #include "tests/unit/core/ring/test_ring.hpp"
 #include "tests/unit/daemon/run_loop.hpp"
 
@@ -102,7 +103,7 @@ TEST_P(NewestFirstEndToEnd, EachSampleIsReceivedOrLostOnce) {
   const auto seed = std::random_device()();
   SCOPED_TRACE("seed " + std::to_string(seed));
   std::mt19937 random(seed);
-  const int rounds = payload_bytes == 40 ? 30 : 8;
+  const int rounds = (payload_bytes == 40 ? 30 : 8) / (test::kIsSanitized ? 4 : 1);
   for (int round = 0; round < rounds && !testing::Test::HasFailure(); ++round) {
     const std::uint64_t depth = 4 + random() % 60;
     const EventLoop loop = *EventLoop::open();
