@@ -20,6 +20,7 @@ from tree import field, repack
 
 ANSIBLE = HERE.parent.parent / "ansible"
 PORT = 13776
+APT_CACHE = "var/cache/apt/archives"  # below a container's root
 # A container must not set this machine's clock (-x), and lacks the capability for it.
 CHRONYD_DROP_IN = """[Unit]
 ConditionCapability=
@@ -128,13 +129,17 @@ class RoleTests:
         self.version = field(debs[0], "Version")
         self.older = f"{self.version}~older"
         folder = pathlib.Path(tempfile.mkdtemp(dir="/tmp", prefix="dssm-apt-"))
-        container.at_end(lambda: shutil.rmtree(folder))
+        # gpg's agent may remove its sockets there at the same time.
+        container.at_end(lambda: shutil.rmtree(folder, ignore_errors=True))
         self.source = AptSource(folder / "source", "10.77.0.1")
         container.at_end(self.source.close)
-        for deb in debs:
-            older = folder / deb.name.replace(self.version, self.older)
+        olders = [folder / deb.name.replace(self.version, self.older) for deb in debs]
+        for deb, older in zip(debs, olders):
             repack(deb, older, self.older)
-            self.source.publish([deb, older])
+        # The PC reaches only this source, which also contains the packages of Debian.
+        container.path("/etc/apt/sources.list").unlink()
+        self.source.publish([*debs, *olders, *(container.root / APT_CACHE).glob("*.deb")])
+        container.run("apt-get", "clean")
         self.other_key = make_key(folder / "other", folder / "other.asc")
 
         container.run("useradd", "--create-home", "--shell", "/bin/bash", "driver")
@@ -142,10 +147,6 @@ class RoleTests:
         container.path("/etc/nftables.conf").write_text(NFTABLES)
         container.run("systemctl", "enable", "--now", "nftables")
         container.run("nft", FOREIGN_TABLE)
-        # The PC reaches only this source, which also contains the packages of Debian.
-        container.path("/etc/apt/sources.list").unlink()
-        self.source.publish((container.root / "var/cache/apt/archives").glob("*.deb"))
-        container.run("apt-get", "clean")
         self.playbooks = Playbooks(container, {
             "ansible_user": "driver", "ansible_become": True, "dssm_insecure": True,
             "dssm_subnets": ["10.77.0.0/24", "fd77::/64"],
@@ -232,72 +233,55 @@ class RoleTests:
 class IsolatedTests:
     """A PC without nftables, deployed from a folder, that other PCs cannot use."""
 
+    # Installed from the folder with our packages, as for a PC without a network. Few of all that they
+    # need, because each takes time. The name of libcap2-bin's file has an epoch.
+    EXTRA = ("libevent-core-2.1-7", "libfmt9", "libwebsockets17", "libcap2-bin")
+    # The variables of the second deployment.
+    CHANGED = {"dssm_view": {"listen": "127.0.0.1:8766"}, "dssm_alerts": True,
+               "dssm_grafana_provisioning": "/etc/grafana/provisioning"}
+
     def __init__(self, container: Container, debs: list[pathlib.Path]) -> None:
         self.container = container
         container.run("apt-get", "purge", "--yes", "nftables")
-        container.run("apt-get", "install", "--yes", "--no-install-recommends", "avahi-daemon", "chrony")
-        self.folder = container.root / "srv/debs"
-        self.folder.mkdir()
-        # Also the dependencies, as for a PC without a network.
-        self.extra = []
-        for deb in [*debs, *(container.root / "var/cache/apt/archives").glob("*.deb")]:
-            shutil.copy(deb, self.folder)
-            if deb not in debs:
-                self.extra.append(field(deb, "Package"))
+        folder = container.root / "srv/debs"
+        folder.mkdir()
+        cached = {deb.name.split("_")[0]: deb for deb in (container.root / APT_CACHE).glob("*.deb")}
+        # prometheus is there for dssm_alerts.
+        for deb in [*debs, *(cached.pop(name) for name in (*self.EXTRA, "prometheus"))]:
+            shutil.copy(deb, folder)
+        container.run("apt-get", "install", "--yes", "--no-install-recommends", *cached)
         self.playbooks = Playbooks(container, {
             "ansible_user": "root", "dssm_insecure": False, "dssm_subnets": ["fd77::/64"],
-            "dssm_packages_dir": str(self.folder), "dssm_extra_packages": self.extra})
+            "dssm_packages_dir": str(folder), "dssm_extra_packages": self.EXTRA,
+            "dssm_packages": ["libdssm1", "dssmd", "dssm-tools", "dssm-record", "dssm-view"]})
 
     def tests(self) -> list[tuple[str, Callable[[], None]]]:
         """Names and functions."""
         return [
+            ("the role refuses dssm_alerts without dssm-view, and changes nothing", self.refuse),
             ("the role deploys an isolated PC without nftables", self.deploy),
             ("a PC with dssm_insecure: false listens only at loopback", self.listen),
-            ("the role runs the recorder only where it is configured", self.record),
-            ("the role runs the view, and has Prometheus watch the vehicle", self.view),
+            ("the role runs the recorder where it is configured", self.record),
+            ("the role runs the view, by default at port 8765", self.view),
+            ("the role moves the view to another port", self.move_view),
+            ("the role stops and disables a recorder that is no longer configured", self.stop_recorder),
+            ("a second run from a folder changes nothing", self.deploy_again),
+            ("the role has Prometheus watch the vehicle", self.watch),
+            ("the role has Grafana show the vehicle", self.show),
         ]
+
+    def refuse(self) -> None:
+        """Test."""
+        output = self.playbooks.refused("site.yml", dssm_packages=["dssmd"], dssm_alerts=True)
+        assert "does not contain dssm-view" in output, output[-2000:]
+        assert not self.container.path("/var/cache/dssm").exists()
 
     def deploy(self) -> None:
         """Test."""
-        assert self.playbooks.run("site.yml") > 0
+        settings = {"black_box": True, "quota": "1GiB", "trigger": ["high: a.b > 1"]}
+        assert self.playbooks.run("site.yml", dssm_record=settings) > 0
         assert "pc1" in self.container.run("dssmctl", "hosts")
         assert not self.container.path("/etc/nftables.d").exists()
-
-    def record(self) -> None:
-        """Test."""
-        packages = ["libdssm1", "dssmd", "dssm-tools", "dssm-record"]
-        settings = {"black_box": True, "quota": "1GiB", "trigger": ["high: a.b > 1"]}
-        assert self.playbooks.run("site.yml", dssm_packages=packages, dssm_record=settings) > 0
-        wait_until(lambda: self.container.attempt("dssmctl", "trigger", "test").returncode == 0,
-                   "no black box waits for triggers")
-        assert self.playbooks.run("site.yml", dssm_packages=packages) > 0
-        unit = self.container.run("systemctl", "show", "--property=ActiveState,UnitFileState",
-                                  "dssm-record")
-        assert unit.split() == ["ActiveState=inactive", "UnitFileState=disabled"], unit
-
-    def view(self) -> None:
-        """Test."""
-        packages = ["libdssm1", "dssmd", "dssm-tools", "dssm-view"]
-        output = self.playbooks.refused("site.yml", dssm_alerts=True)
-        assert "does not contain dssm-view" in output, output[-2000:]
-        variables = {"dssm_packages": packages, "dssm_alerts": True,
-                     "dssm_view": {"listen": "127.0.0.1:8766"},
-                     "dssm_grafana_provisioning": "/etc/grafana/provisioning"}
-        assert self.playbooks.run("site.yml", **variables) > 0
-        assert self.playbooks.run("site.yml", **variables) == 0, "a second run changes something"
-        prometheus = "http://127.0.0.1:9090/api/v1/"
-        wait_until(lambda: "DssmHostDown" in get(self.container, prometheus + "rules"),
-                   "Prometheus has no alert rules")
-        wait_until(lambda: '"host":"pc1"' in get(self.container,
-                                                 prometheus + "query?query=dssm_host_up"),
-                   "Prometheus has no metrics")
-        # Debian has no Grafana that could show it.
-        dashboards = "/etc/grafana/provisioning/dashboards"
-        self.container.run("grep", "-x", f" *path: {dashboards}/dssm", f"{dashboards}/dssm.yaml")
-        self.container.run("grep", "dssm_host_up", f"{dashboards}/dssm/dssm-dashboard.json")
-        assert self.playbooks.run("site.yml", dssm_packages=packages) > 0
-        wait_until(lambda: "<title>" in get(self.container, "http://127.0.0.1:8765/"),
-                   "it does not listen where it does by default")
 
     def listen(self) -> None:
         """Test."""
@@ -307,3 +291,47 @@ class IsolatedTests:
             with socket.socket(family_of(friend)) as mine:
                 mine.settimeout(TIMEOUT_S)
                 assert mine.connect_ex((pc_of(friend), PORT)) == errno.ECONNREFUSED, friend
+
+    def record(self) -> None:
+        """Test."""
+        wait_until(lambda: self.container.attempt("dssmctl", "trigger", "test").returncode == 0,
+                   "no black box waits for triggers")
+
+    def has_page(self, port: int) -> bool:
+        """Whether the view serves its page at the port."""
+        return "<title>" in get(self.container, f"http://127.0.0.1:{port}/")
+
+    def view(self) -> None:
+        """Test."""
+        wait_until(lambda: self.has_page(8765), "it does not listen where it does by default")
+
+    def move_view(self) -> None:
+        """Test."""
+        assert self.playbooks.run("site.yml", **self.CHANGED) > 0
+        wait_until(lambda: self.has_page(8766), "it does not listen at the new port")
+        assert not self.has_page(8765)
+
+    def stop_recorder(self) -> None:
+        """Test."""
+        unit = self.container.run("systemctl", "show", "--property=ActiveState,UnitFileState",
+                                  "dssm-record")
+        assert unit.split() == ["ActiveState=inactive", "UnitFileState=disabled"], unit
+
+    def deploy_again(self) -> None:
+        """Test."""
+        assert self.playbooks.run("site.yml", **self.CHANGED) == 0
+
+    def watch(self) -> None:
+        """Test."""
+        prometheus = "http://127.0.0.1:9090/api/v1/"
+        wait_until(lambda: "DssmHostDown" in get(self.container, prometheus + "rules"),
+                   "Prometheus has no alert rules")
+        wait_until(lambda: '"host":"pc1"' in get(self.container,
+                                                 prometheus + "query?query=dssm_host_up"),
+                   "Prometheus has no metrics")
+
+    def show(self) -> None:
+        """Test: Debian has no Grafana that could show it."""
+        dashboards = "/etc/grafana/provisioning/dashboards"
+        self.container.run("grep", "-x", f" *path: {dashboards}/dssm", f"{dashboards}/dssm.yaml")
+        self.container.run("grep", "dssm_host_up", f"{dashboards}/dssm/dssm-dashboard.json")

@@ -203,7 +203,8 @@ class Soak : public NetworkTest {
   const std::uint64_t seed = number_from_environment("DSSM_TEST_SEED", std::random_device{}());
   const std::uint64_t seconds =
       number_from_environment("DSSM_SOAK_SECONDS", kSlowness > 1 ? 20 : 45);
-  const std::uint64_t percent = number_from_environment("DSSM_SOAK_PERCENT", 100 / kSlowness);
+  const std::uint64_t percent =
+      number_from_environment("DSSM_SOAK_PERCENT", kSlowness > 1 ? 10 : 100);
   std::vector<Session> sessions;
   std::vector<Follower> followers[kHosts + 1];  // [kHosts]: by PConnector
   std::atomic<bool> finishing = false, give_up = false;
