@@ -4,11 +4,13 @@
 #include <fmt/format.h>
 
 #include <algorithm>
+#include <random>
 #include <utility>
 
 #include "client/dssmctl/black_box_streams.hpp"
 #include "client/dssmctl/text.hpp"
 #include "client/dssmctl/trigger_watch.hpp"
+#include "core/base/text.hpp"
 #include "core/base/try.hpp"
 
 namespace dssm::ctl {
@@ -24,7 +26,10 @@ class BlackBox {
         recorder_(recorder),
         watch_(watch),
         folder_(folder),
-        out_(out) {}
+        out_(out) {
+    std::random_device random;
+    how_.recording = hex(std::uint64_t{random()} << 32 | random());
+  }
 
   // Until a stop signal; an incident that is being recorded ends then, too.
   void run() {
@@ -105,6 +110,7 @@ class BlackBox {
     const Result<void> ended = recorder_.end();
     make_room();
     written_bytes_ += recorder_.progress().file_bytes;
+    how_.earlier_files += recorder_.progress().files;
     if (failed || !ended) {
       notice(escaped_message(failed ? failed->message : ended.error().message));
     }
@@ -155,7 +161,7 @@ class BlackBox {
 
   const RecordOptions& options_;
   Session session_;
-  const RecordingOptions& how_;
+  RecordingOptions how_;  // all incidents are one recording
   Recorder& recorder_;
   TriggerWatch& watch_;
   RecordingFolder& folder_;

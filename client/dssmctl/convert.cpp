@@ -201,7 +201,18 @@ class Converter {
     }
   }
 
+  // What was made of it when it fails is removed: half of a recording looks like a whole one.
   Result<Converted> run() {
+    Result<Converted> done = convert();
+    std::error_code ignored;
+    for (const fs::path& path : created_) {
+      if (!done) fs::remove(path, ignored);
+    }
+    return done;
+  }
+
+ private:
+  Result<Converted> convert() {
     if (wanted_.empty()) return Error{Errc::not_found, "no stream of the recording fits"};
     const fs::path out = options_.out;
     if (out.extension() == ".mcap") return to_mcap();
@@ -215,7 +226,6 @@ class Converter {
     return to_logs(log_paths(out));
   }
 
- private:
   const RecordedStreamInfo& info(std::size_t stream) const { return recording_.streams()[stream]; }
 
   // Why the wanted streams are not one log, and what to do.
@@ -240,6 +250,7 @@ class Converter {
     RecordingOptions how;
     how.compression = compression_of(options_.compression);
     McapOutput file(DSSM_TRY(RecordingWriter::create(options_.out, how)), recording_);
+    created_.emplace_back(options_.out);
     for (const std::size_t i : wanted_) DSSM_TRY(file.add(i));
     Converted done{{options_.out}};
     RecordingCursor cursor = recording_.cursor();
@@ -279,6 +290,7 @@ class Converter {
     Converted done;
     for (std::size_t i = 0; i < wanted_.size(); ++i) {
       logs[wanted_[i]] = DSSM_TRY(LogOutput::create(paths[i], info(wanted_[i])));
+      created_.push_back(paths[i]);
       done.files.push_back(paths[i].string());
     }
     RecordingCursor cursor = recording_.cursor();
@@ -297,6 +309,7 @@ class Converter {
   const Recording& recording_;
   StreamFilter filter_;
   std::vector<std::size_t> wanted_;  // numbers of streams
+  std::vector<fs::path> created_;
 };
 
 }  // namespace

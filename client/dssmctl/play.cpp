@@ -718,9 +718,9 @@ Result<void> run(const PlayOptions& options, Output& out) {
     DSSM_TRY(player.prepare());
     catch_stop_signals();
     Result<void> played;
+    std::optional<SharedPlayback> others;
+    if (clock && !options.this_host) others.emplace(sharing, *clock, print_notice);
     if (options.lockstep.empty()) {
-      std::optional<SharedPlayback> others;
-      if (clock && !options.this_host) others.emplace(sharing, *clock, print_notice);
       Timeline timeline(std::move(clock), others ? SharedPlayback::kLead : Duration::zero());
       played = player.play_by(timeline);
     } else {

@@ -294,7 +294,16 @@ void Recorder::Opener::run() {
     if (opened && entry != wanted_.end() && incarnation != 0 &&
         opened->reader.incarnation() == entry->replaced_incarnation) {
       entry->is_opening = false;
-      entry->due = deadline_in(kReopenPeriod);
+      if (entry->late_at == MonoTime()) entry->late_at = deadline_in(kReopenTime);
+      const bool is_late = MonoClock::now() >= entry->late_at;
+      entry->due = deadline_in(is_late ? kRetryPeriod : kReopenPeriod);
+      if (!is_late || entry->reported) continue;
+      notices_.push_back(
+          fmt::format("'{}' is not recorded yet: it was created again, and this PC still has what "
+                      "it was before; see `dssmctl info {}`",
+                      escaped(wanted.stream.id.str()), escaped(wanted.stream.id.str())));
+      if (entry->from_start) --untried_;
+      entry->reported = true;
       continue;
     }
     const bool is_wanted = entry != wanted_.end();

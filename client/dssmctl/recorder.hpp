@@ -105,7 +105,10 @@ class Recorder {
   static constexpr Duration kMinPeriod = std::chrono::milliseconds(1);
   static constexpr Duration kMaxPeriod = std::chrono::milliseconds(50);
   static constexpr Duration kRetryPeriod = std::chrono::seconds(1);
+  // A ring that is to be replaced is opened again each kReopenPeriod, after kReopenTime each
+  // kRetryPeriod.
   static constexpr Duration kReopenPeriod = std::chrono::milliseconds(50);
+  static constexpr Duration kReopenTime = std::chrono::seconds(2);
   static constexpr Duration kEndingTime = std::chrono::seconds(1);
   // So long the past waits for streams to be opened.
   static constexpr Duration kOpeningTime = std::chrono::seconds(1);
@@ -191,6 +194,7 @@ class Recorder {
       // The incarnation before, which was opened: all samples of this one are wanted.
       std::optional<std::uint64_t> replaced_incarnation = {};
       bool is_opening = false;
+      MonoTime late_at{};  // when to say that there is still the ring before
     };
     // Of a name: the incarnation that was opened last, and the type that the next one needs so that
     // its reader can continue with it.

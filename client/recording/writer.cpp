@@ -68,10 +68,13 @@ std::filesystem::path numbered(const std::filesystem::path& file, std::uint32_t 
 Result<std::unique_ptr<Writer>> Writer::create(const std::filesystem::path& file,
                                                const RecordingOptions& options) {
   DSSM_TRY(check_options(options), fmt::format("create recording '{}'", file.string()));
-  std::uint64_t random = 0;
-  (void)!::getrandom(&random, sizeof random, 0);
-  const std::string recording = hex(random);
-  FileWriter first = DSSM_TRY(FileWriter::create(file, recording, 0));
+  std::string recording = options.recording;
+  if (recording.empty()) {
+    std::uint64_t random = 0;
+    (void)!::getrandom(&random, sizeof random, 0);
+    recording = hex(random);
+  }
+  FileWriter first = DSSM_TRY(FileWriter::create(file, recording, options.earlier_files));
   std::unique_ptr<Writer> writer(new Writer(file, completed(options), recording, std::move(first)));
   writer->disk_thread_ =
       DSSM_TRY(quiet_thread("the recording", [raw = writer.get()] { raw->run_disk(); }));
@@ -440,7 +443,8 @@ Result<void> Writer::begin_file() {
   DSSM_TRY(finish_file());
   while (true) {
     ++file_number_;
-    Result<FileWriter> next = FileWriter::create(numbered(file_, file_number_), recording_, files_);
+    Result<FileWriter> next = FileWriter::create(numbered(file_, file_number_), recording_,
+                                                 options_.earlier_files + files_);
     if (!next && next.error().code == Errc::conflict) continue;  // of another recording
     FileWriter created = DSSM_TRY(std::move(next));
     finished_files_.emplace_back(current_.path(), current_.bytes());

@@ -143,9 +143,9 @@ void Dialer::try_addresses(std::vector<wire::SocketAddress> found) {
 
 void Dialer::try_address() {
   attempts_.clear();
+  reached_ = Phase::connect;
   if (Result<void> begun = begin_attempt(); !begun) return try_next_address(begun.error());
   state_ = State::connect;
-  reached_ = Phase::connect;
   await_answer();
 }
 

@@ -151,6 +151,8 @@ class ServiceTests:
         run("systemd-run", "--unit=other", "dssmd", "--runtime-dir", other, "--name", "other", "--mdns=false",
             "--listen", "127.0.0.1:13777", "--peer", "127.0.0.1:13776")
         run("systemd-run", "--unit=writer", "dssmctl", "play", "/speed.log", "--now")
+        asked = ("dssmctl", "--socket", f"{other}/dssmd.sock", "hosts")
+        wait_until(lambda: self.container.attempt(*asked).returncode == 0, "the other dssmd does not answer")
         delays_ms = []
         for signal in ("", "", "", "KILL", "KILL", "KILL"):
             with subprocess.Popen(

@@ -79,6 +79,11 @@ struct RecordingOptions {
   // Of all files of this recording: the oldest ones are deleted when there are more. Without
   // max_file_bytes, that is an eighth of this then. 0: no limit.
   std::uint64_t max_total_bytes = 0;
+  // For a recording by several writers, one after the other: an id that they share, and how many
+  // files the earlier ones have begun (RecordingProgress::files). Recording::open() has their
+  // samples in the order in which they were written. Empty: an id of its own.
+  std::string recording = {};
+  std::uint32_t earlier_files = 0;
 };
 
 struct RecordingProgress {
@@ -86,7 +91,7 @@ struct RecordingProgress {
   std::uint64_t payload_bytes = 0;
   std::uint64_t lost_samples = 0;   // of add_gap()
   std::uint64_t file_bytes = 0;     // written to all files, also to those that are deleted
-  std::uint32_t files = 0;          // begun
+  std::uint32_t files = 0;          // begun, by this writer
   std::uint64_t waiting_bytes = 0;  // of samples that are not yet in a file
 };
 

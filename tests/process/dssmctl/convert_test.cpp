@@ -171,6 +171,11 @@ TEST_F(Convert, RefusesWhatWouldLoseSomething) {
   save("c.mcap", "mine");
   EXPECT_TRUE(contains(refusal({"convert", a, b, file("c.mcap")}), "exists"));
   EXPECT_EQ(content_of(file("c.mcap")), "mine");
+  fs::create_directory(file("both"));
+  save("both/b-0.log", "mine");
+  EXPECT_TRUE(contains(refusal({"convert", a, b, file("both")}), "b-0.log': the file exists"));
+  EXPECT_FALSE(fs::exists(file("both/a-0.log"))) << "the next try would find it";
+  EXPECT_EQ(content_of(file("both/b-0.log")), "mine");
   const std::string cut = save("cut.log", content_of(a) + "rest");
   const Finished warned = ctl({"convert", cut, file("cut.mcap")});
   EXPECT_EQ(warned.exit_status, 0);

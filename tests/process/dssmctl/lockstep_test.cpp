@@ -130,8 +130,11 @@ TEST_F(Lockstep, OfAPlayerThatWasKilledEnds) {
   await([&] { return session_.list_streams().value().size() == 1; });
   auto fast = session_.create<Numbered>("fast", depth_of(64)).value();
   await([&] { return session_.stream_info(fast.id()).value().readers == 1; });
+  const PlaybackClock clock = session_.open_playback_clock().value();
+  EXPECT_NE(clock.setting(), PlaybackClock::Setting());
   running.signal(SIGKILL);
   running.status();
+  await([&] { return clock.setting() == PlaybackClock::Setting(); });
   fast.write({5}, at_ns(kSecond));
   await([&] { return contains(text_of(out), "fast 5 "); });
   for (const OpenInfo& open : session_.list_opens().value()) {

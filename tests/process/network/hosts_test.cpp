@@ -147,6 +147,7 @@ TEST_F(Hosts, AreNotCalledWithoutACarrier) {
     return host_info(there, "pc1").error.find("interface 'eth0' has no carrier") !=
            std::string::npos;
   });
+  EXPECT_EQ(host_info(there, "pc1").reason, HostReason::no_answer) << "doctor's advice is for that";
   EXPECT_FALSE(has_connection(*fleet));
   fleet->network().heal(2);
   await_up(there, 1);

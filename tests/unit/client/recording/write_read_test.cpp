@@ -515,6 +515,27 @@ TEST_F(RecordingFiles, KeepThePropertyThatEachOfSeveralRecordingsBeganWith) {
 
 // Before properties had times, each file began with one of time 0, and a change had the time of the
 // chunk before.
+TEST_F(RecordingFiles, OfSeveralWritersAreOneInTheOrderOfWriting) {
+  RecordingOptions options;
+  options.recording = "of two";
+  RecordingWriter first = RecordingWriter::create(path("b.mcap"), options).value();
+  const auto a = first.add_stream(plain_stream("a", 24)).value();
+  const auto b = first.add_stream(plain_stream("b", 24)).value();
+  write(first, b, sample_at(0, 200));
+  write(first, a, sample_at(50, 190));  // later than it was due
+  ASSERT_TRUE(first.finish());
+  options.earlier_files = first.progress().files;
+  RecordingWriter second = RecordingWriter::create(path("a.mcap"), options).value();
+  ASSERT_EQ(second.add_stream(plain_stream("a", 24)).value(), 0U);
+  ASSERT_EQ(second.add_stream(plain_stream("old", 24)).value(), 1U);
+  write(second, 0, sample_at(51, 191));
+  write(second, 1, sample_at(0, 100));
+  ASSERT_TRUE(second.finish());
+  std::vector<Tid> tids;
+  for (const Recorded& sample : all_of(open_recording(folder_))) tids.push_back(sample.info.tid);
+  EXPECT_EQ(tids, (std::vector<Tid>{0, 50, 51, 0}));
+}
+
 TEST_F(RecordingFiles, OpenFromBeforePropertiesHadTimes) {
   std::vector<std::filesystem::path> files;
   for (const int number : {0, 1}) {
