@@ -18,6 +18,7 @@
 #include "core/base/sealed_memory.hpp"
 #include "core/ring/bell.hpp"
 #include "core/ring/ring_writer.hpp"
+#include "tests/support/sanitized.hpp"
 #include "tests/unit/daemon/daemon_fixtures.hpp"
 
 namespace dssm::daemon {
@@ -202,6 +203,7 @@ TEST(Registry, LeavesNoDescriptorBehind) {
 
 // Half a gigabyte: the thread that closes the last descriptor frees it.
 TEST(Stream, LetsAThreadFreeALongRing) {
+  if (test::kIsSanitized) GTEST_SKIP() << "a sanitizer takes longer to begin a thread";
   Registry registry("pc1", {10, 4ULL << 30, 1 << 20});
   const auto time_of = [](auto work) {  // of this thread's processor
     timespec begin, end;
