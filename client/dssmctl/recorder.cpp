@@ -299,8 +299,8 @@ void Recorder::Opener::run() {
       entry->due = deadline_in(is_late ? kRetryPeriod : kReopenPeriod);
       if (!is_late || entry->reported) continue;
       notices_.push_back(
-          fmt::format("'{}' is not recorded yet: it was created again, and this PC still has what "
-                      "it was before; see `dssmctl info {}`",
+          fmt::format("'{}' is not recorded yet: it was created again, and this PC still has its "
+                      "earlier ring; see `dssmctl info {}`",
                       escaped(wanted.stream.id.str()), escaped(wanted.stream.id.str())));
       if (entry->from_start) --untried_;
       entry->reported = true;
