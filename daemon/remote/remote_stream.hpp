@@ -195,7 +195,6 @@ class RemoteStream : private Dialer::Observer, protected channel::ChannelClient:
   // samples.
   virtual void on_stream_removed(std::uint64_t /*incarnation*/) {}
   // It has sent new values of its clock.
-  // NOLINTNEXTLINE(performance-unnecessary-value-param): a mirror keeps it
   virtual void on_owner_clock(std::shared_ptr<const wire::ClockReport> /*report*/) {}
 
  protected:

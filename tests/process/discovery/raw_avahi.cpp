@@ -23,11 +23,6 @@
 #include <cstring>
 #include <string>
 
-#ifdef __SANITIZE_THREAD__
-// libdbus takes two of its locks in both orders; that is not what is tested here.
-extern "C" const char* __tsan_default_suppressions() { return "deadlock:libdbus-1\n"; }
-#endif
-
 namespace {
 
 AvahiSimplePoll* simple_poll = nullptr;

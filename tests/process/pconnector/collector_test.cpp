@@ -222,9 +222,6 @@ TEST_F(SampleCollection, ReportsAnErrorAndContinuesAfterARestartOfDssmd) {
 }
 
 TEST_F(SampleCollection, AForkedChildReadsWhatItsParentCollects) {
-#ifdef __SANITIZE_THREAD__
-  GTEST_SKIP() << "the thread sanitizer knows no threads in forked children";
-#endif
   auto writer = make(64);
   std::optional<SampleCollector> collector = collect();
   int written_pipe[2];

@@ -24,9 +24,6 @@ TEST_P(SsmProgram, ChecksHold) { expect_checks_hold(GetParam(), false); }
 class SsmProcesses : public testing::TestWithParam<std::string> {};
 
 TEST_P(SsmProcesses, ChecksHold) {
-#ifdef __SANITIZE_THREAD__
-  GTEST_SKIP() << "the thread sanitizer holds signals back and knows no threads in forked children";
-#endif
   if (kIsSanitized && GetParam().ends_with("c++20")) {
     GTEST_SKIP() << "the same program is tested in another dialect";
   }

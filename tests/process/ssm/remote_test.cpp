@@ -28,9 +28,6 @@ TEST_P(SsmRemoteProgram, ChecksHold) { expect_checks_hold(GetParam(), true); }
 class SsmRemoteProcesses : public testing::TestWithParam<std::string> {};
 
 TEST_P(SsmRemoteProcesses, ChecksHold) {
-#ifdef __SANITIZE_THREAD__
-  GTEST_SKIP() << "the thread sanitizer holds signals back and knows no threads in forked children";
-#endif
   expect_checks_hold(GetParam(), true);
 }
 
