@@ -539,7 +539,8 @@ Result<void> Recorder::add_to_file(Source& source) {
       opener_.described(reader.id(), reader.incarnation()).value_or(reader.type());
   source.number = DSSM_TRY(file_->add_stream(
       {reader.id(), type, reader.depth(), reader.cycle(), reader.incarnation(), source.property}));
-  if (source.number == newest_tids_.size()) newest_tids_.push_back(kNoTid);
+  // What is not wanted of it now is not later, either.
+  if (source.number == newest_tids_.size()) newest_tids_.push_back(source.next - 1);
   // It was recorded before, and could not be read for a while.
   if (const Tid newest = newest_tids_[source.number]; newest > source.reader.cursor()) {
     source.reader.seek(newest);

@@ -209,8 +209,8 @@ void Mirror::assess_clock() {
 
 [[gnu::hot]] Result<void> Mirror::on_sample_end(const wire::IncomingSample& sample, bool torn) {
   ring_->end(sample, torn);
-  is_fresh_ = is_fresh_ || !torn;
   log_new_gap();
+  if (!torn && !std::exchange(is_fresh_, true)) answer_ready();
   return {};
 }
 

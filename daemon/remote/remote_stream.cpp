@@ -4,6 +4,7 @@
 #include <fmt/format.h>
 
 #include <algorithm>
+#include <iterator>
 #include <utility>
 
 #include "core/base/try.hpp"
@@ -164,7 +165,7 @@ void RemoteStream::open(const CreatePlan* plan, Then then, bool waits_for_histor
     return after_pending();
   }
   pending_.push_back({std::move(then), plan ? std::optional(*plan) : std::nullopt,
-                      parts_.loop.deadline_in(open_timeout())});
+                      parts_.loop.deadline_in(open_timeout()), waits_for_history});
   arm_pending_timer();
   if (is_removed_) connection_.reopen();
 }
@@ -215,6 +216,23 @@ void RemoteStream::answer_pending(bool created) {
   after_pending();
 }
 
+template <typename Condition>
+std::vector<RemoteStream::PendingOpen> RemoteStream::take_pending(Condition condition) {
+  const auto rest = std::stable_partition(pending_.begin(), pending_.end(), condition);
+  std::vector<PendingOpen> taken(std::make_move_iterator(pending_.begin()),
+                                 std::make_move_iterator(rest));
+  pending_.erase(pending_.begin(), rest);
+  return taken;
+}
+
+void RemoteStream::answer_ready() {
+  const std::vector<PendingOpen> ready =
+      take_pending([this](const PendingOpen& one) { return can_open_now(one.waits_for_history); });
+  if (ready.empty()) return;
+  for (const PendingOpen& one : ready) one.then(opened(one.plan ? &*one.plan : nullptr));
+  after_pending();
+}
+
 void RemoteStream::fail_pending(const Error& why) {
   if (pending_.empty()) return;
   for (const PendingOpen& one : std::exchange(pending_, {})) one.then(why);
@@ -250,11 +268,8 @@ void RemoteStream::arm_pending_timer() {
 // A mirror that is being filled is handed out with what it holds.
 void RemoteStream::on_pending_timer() {
   const MonoTime now = parts_.loop.now();
-  const auto later =
-      std::stable_partition(pending_.begin(), pending_.end(),
-                            [now](const PendingOpen& one) { return one.deadline <= now; });
-  const std::vector<PendingOpen> overdue(pending_.begin(), later);
-  pending_.erase(pending_.begin(), later);
+  const std::vector<PendingOpen> overdue =
+      take_pending([now](const PendingOpen& one) { return one.deadline <= now; });
   for (const PendingOpen& one : overdue) {
     if (stream() && !is_removed_) {
       one.then(opened(one.plan ? &*one.plan : nullptr));

@@ -253,6 +253,7 @@ class RemoteStream : private Dialer::Observer, protected channel::ChannelClient:
   const std::optional<CreatePlan>* first_pending() const noexcept;  // nullptr: none waits
   void set_pending_deadline(MonoTime deadline);
   void answer_pending(bool created);
+  void answer_ready();  // those of the pending ones for which can_open_now()
   void fail_pending(const Error& why);
   void fail_first_pending(const Error& why);
   void finish();
@@ -290,11 +291,15 @@ class RemoteStream : private Dialer::Observer, protected channel::ChannelClient:
     Then then;
     std::optional<CreatePlan> plan;
     MonoTime deadline;
+    bool waits_for_history;
   };
   void end_channel();
   void send_users();
   void log_stopped();
   Result<OpenedRing> opened(const CreatePlan* plan);
+  // Takes out those that meet it.
+  template <typename Condition>
+  std::vector<PendingOpen> take_pending(Condition condition);
   void after_pending();
   void arm_pending_timer();
   void on_pending_timer();

@@ -215,7 +215,11 @@ TEST(RecorderOfAnyUser, GoesOnWhereItWasWhenItMayReadAgain) {
   allow("read");
   const DaemonProcess daemon({"--config", configuration, "--listen", "", "--socket-mode", "0666"});
   ASSERT_EQ(::chmod(daemon.runtime_dir().c_str(), 0755), 0);
-  constexpr int kSamples = 25;
+  Session root = session_with(daemon);
+  Writer<double> writer = root.create<double>("lidar", {64, Duration(1)}).value();
+  constexpr int kEarlier = 5, kSamples = 30;
+  int written = 0;
+  while (written < kEarlier) writer.write(written++);
   const pid_t child = ::fork();
   if (child == 0) {
     become_nobody({});
@@ -235,26 +239,25 @@ TEST(RecorderOfAnyUser, GoesOnWhereItWasWhenItMayReadAgain) {
     }
     ::_exit(recorder->finish() ? 0 : 1);
   }
-  Session root = session_with(daemon);
-  Writer<double> writer = root.create<double>("lidar", {64, Duration(1)}).value();
-  int written = 0;
   const auto write_when = [&](std::uint32_t readers, int samples) {
     await([&] { return root.stream_info({"lidar", 0, ""}).value().readers == readers; });
     for (int i = 0; i < samples; ++i) writer.write(written++);
   };
+  for (const int recorded_before : {0, 10}) {
+    write_when(1, recorded_before);
+    allow("write");
+    ::kill(daemon.pid(), SIGHUP);
+    write_when(0, 5);
+    await([&] { return std::filesystem::remove(refused); });
+    allow("read");
+    ::kill(daemon.pid(), SIGHUP);
+  }
   write_when(1, 10);
-  allow("write");
-  ::kill(daemon.pid(), SIGHUP);
-  write_when(0, 5);
-  await([&] { return std::filesystem::exists(refused); });
-  allow("read");
-  ::kill(daemon.pid(), SIGHUP);
-  write_when(1, 10);
-  ASSERT_EQ(written, kSamples);
+  ASSERT_EQ(written, kEarlier + kSamples);
   EXPECT_EQ(wait_for(child), 0);
   const Recording recording = Recording::open(file).value();
   ASSERT_EQ(recording.streams().size(), 1U);
-  EXPECT_EQ(recording.streams()[0].samples, std::uint64_t{kSamples});
+  EXPECT_EQ(recording.streams()[0].samples, std::uint64_t{kSamples}) << "nor what was there before";
   EXPECT_EQ(recording.streams()[0].lost_samples, 0U);
 }
 

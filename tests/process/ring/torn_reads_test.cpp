@@ -19,7 +19,7 @@ namespace dssm::ring {
 namespace {
 
 #if defined(__SANITIZE_ADDRESS__) || defined(DSSM_TSAN)
-constexpr std::int64_t kShare = 50;
+constexpr std::int64_t kShare = 200;
 #else
 constexpr std::int64_t kShare = 1;
 #endif

@@ -221,13 +221,16 @@ TEST_F(MirrorsTest, DoesNotLetThoseWaitForHistoryWhoDidNotAskForIt) {
   const auto recorder = open();
   streams->find(kOdometry)->want_history(true);
   serve(10);
-  EXPECT_FALSE(open_without()->has_value()) << "there is no sample yet";
+  const auto early = open_without();
+  EXPECT_FALSE(early->has_value()) << "there is no sample yet";
   owner->send_sample({10, {}, {}}, Bytes(24), true);
   run_turns(loop, 300);
   EXPECT_FALSE(open_without()->has_value()) << "it was overwritten while it was sent";
   samples(11, 11);
   run_until(loop, [&] { return find() && newest(*find()) == 11; });
   EXPECT_EQ(state().state(), proto::Mirror::FILLING);
+  ASSERT_TRUE(early->has_value()) << "it waited for what it did not ask for";
+  EXPECT_EQ(newest(*early->value().value().stream), 11);
   const auto at_once = open_without();
   ASSERT_TRUE(at_once->has_value());
   EXPECT_EQ(newest(*at_once->value().value().stream), 11);
