@@ -742,8 +742,8 @@ Result<bool> Recorder::take_next(Turn& turn) {
   if (status == ReadStatus::restarted) {
     on_restarted(source);
     if (source.is_over) return false;
-    DSSM_TRY(add_to_file(source));
     source.next = 0;
+    DSSM_TRY(add_to_file(source));
     source.past_until = kNoTid;
     source.from.reset();
     return true;
