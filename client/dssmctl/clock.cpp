@@ -255,25 +255,41 @@ Result<void> tabulate_clocks(Session& session, const ClockOptions& options, Outp
   return {};
 }
 
-// Waits until this host's clock is good enough; prints it, or fails with the reason.
+// Why reads by time do not accept the samples of all hosts that are up; empty: they do. Where no
+// other host is up, this one's clock counts.
+std::optional<Error> not_good(const std::vector<HostInfo>& hosts) {
+  bool is_alone = true;
+  for (const HostInfo& host : hosts) {
+    if (!is_up(host.state) || host.state == HostState::self) continue;
+    is_alone = false;
+    if (!host.clock_reason.empty()) {
+      return Error{Errc::clock_out_of_bounds,
+                   fmt::format("the times of '{}''s samples are not good here: {}", host.name,
+                               host.clock_reason)};
+    }
+  }
+  const HostInfo& self = hosts.front();
+  if (!is_alone || (self.clock && is_good(*self.clock))) return std::nullopt;
+  return Error{Errc::clock_out_of_bounds,
+               fmt::format("no other host is up, and the clock of this host is {}; see `chronyc "
+                           "tracking` and `systemctl status chrony`",
+                           self.clock ? status_text(*self.clock) : "not watched")};
+}
+
+// Waits until the clocks are good enough; prints this host's, or fails with the reason.
 Result<void> await_clock(Session& session, const ClockOptions& options, Output& out) {
   catch_stop_signals();
   const MonoTime deadline = deadline_in(*options.wait);
   for (bool is_first = true;; is_first = false) {
     const std::vector<HostInfo> hosts = DSSM_TRY(session.list_hosts());
-    const HostInfo& self = hosts.front();
-    if (self.clock && is_good(*self.clock)) {
-      print_clocks({self}, options, out);
+    const std::optional<Error> bad = not_good(hosts);
+    if (!bad) {
+      print_clocks({hosts.front()}, options, out);
       return {};
     }
-    const Error bad = {
-        Errc::clock_out_of_bounds,
-        fmt::format("the clock of this host is {}; see `chronyc tracking` and `systemctl "
-                    "status chrony`",
-                    self.clock ? status_text(*self.clock) : "not watched")};
     const MonoTime now = MonoClock::now();
-    if (now >= deadline || stop_requested()) return bad;
-    if (is_first) print_waiting(options, *options.wait, bad);
+    if (now >= deadline || stop_requested()) return *bad;
+    if (is_first) print_waiting(options, *options.wait, *bad);
     std::this_thread::sleep_for(std::min(deadline - now, kStopCheckPeriod));
   }
 }

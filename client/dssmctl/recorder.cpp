@@ -347,19 +347,21 @@ Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
   Source source{std::move(reader)};
   if (property) source.property = *std::move(property);
   const Tid newest = source.reader.newest_tid();
-  // The stamps of a recording that is being played are of another time than now. What lists say of
-  // another host's stream is without its state.
-  if (wanted.stream.state == StreamState::unknown) {
-    const Result<StreamInfo> now = session.stream_info(wanted.stream.id);
-    source.is_of_now = !now || now->state != StreamState::unknown;
-  }
+  Tid newest_there = newest;  // at its owner: on a slow network no sample may be here yet
   const StreamInfo& then = wanted.stream;  // as dssmd reported it
   const std::uint64_t incarnation = source.reader.incarnation();
+  // The stamps of a recording that is being played are of another time than now. What lists say of
+  // another host's stream is without its state.
+  if (then.state == StreamState::unknown) {
+    const Result<StreamInfo> now = session.stream_info(then.id);
+    source.is_of_now = !now || now->state != StreamState::unknown;
+    if (now && now->incarnation == incarnation) newest_there = std::max(newest, now->newest);
+  }
   const bool is_known = then.incarnation == incarnation &&
                         (then.newest != kNoTid || then.state == StreamState::empty);
   if (!with_history) {
     // What was written since the recording began, if dssmd said what was there then.
-    const Tid before = is_known ? std::min(then.newest, newest) : newest;
+    const Tid before = is_known ? std::min(then.newest, newest_there) : newest_there;
     source.reader.seek(before);
     source.next = before + 1;
   } else {
@@ -744,7 +746,7 @@ Result<bool> Recorder::take_next(Turn& turn) {
     if (source.is_over) return false;
     source.next = 0;
     DSSM_TRY(add_to_file(source));
-    source.past_until = kNoTid;
+    source.past_until = source.last_wanted = kNoTid;
     source.from.reset();
     return true;
   }

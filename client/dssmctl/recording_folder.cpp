@@ -92,8 +92,11 @@ Result<void> RecordingFolder::make_room(std::uint64_t written_bytes) {
     return {};
   }
   checked_at_bytes_ = written_bytes;
-  const std::vector<RecordingFile> files = DSSM_TRY(files_of(folder_));
+  std::vector<RecordingFile> files = DSSM_TRY(files_of(folder_));
   if (quota_bytes_ == 0) return {};
+  // The clock may have been set, or have been wrong since the PC's start.
+  for (const RecordingFile& file : files) first_seen_.try_emplace(file.path, first_seen_.size());
+  std::ranges::sort(files, {}, [this](const auto& file) { return first_seen_.at(file.path); });
   std::uint64_t total = 0;
   for (const RecordingFile& file : files) total += file.bytes;
   for (std::size_t i = 0; i + 1 < files.size() && total > quota_bytes_ - 2 * part; ++i) {

@@ -7,6 +7,7 @@
 #include <dssm/result.hpp>
 #include <dssm/time.hpp>
 #include <filesystem>
+#include <map>
 #include <optional>
 #include <string>
 #include <string_view>
@@ -32,7 +33,8 @@ class RecordingFolder {
   const std::filesystem::path& path() const { return folder_; }
 
   // Deletes the oldest recordings until the others leave some of the quota free, but never the
-  // newest one, which may be open for writing. Does nothing while little was written since the last
+  // newest one, which may be open for writing. What was there at the first call is older than what
+  // came later, whatever the files' times say. Does nothing while little was written since the last
   // call; the first one finds out whether the folder can be read.
   //   written_bytes  to the folder since this object exists
   //   fails          not_found, no_permission, system (the folder cannot be read, or a file not be
@@ -51,6 +53,7 @@ class RecordingFolder {
   std::filesystem::path folder_;
   std::uint64_t quota_bytes_;
   std::optional<std::uint64_t> checked_at_bytes_;
+  std::map<std::filesystem::path, std::size_t> first_seen_;  // with which number
   std::vector<std::string> notices_;
 };
 

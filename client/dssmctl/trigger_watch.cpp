@@ -172,16 +172,18 @@ void TriggerEvaluator::on_sample(const StreamId& stream, const SampleInfo& info,
     if (found && !check.held) {
       fire({rule.name,
             fmt::format("{} of '{}' is {}", escaped(check.field.name), stream.str(), *found),
-            stream.host, info.time});
+            stream.host, info.time},
+           stream.str());
     }
     check.held = found.has_value();
   }
 }
 
 void TriggerEvaluator::on_request(const TriggerRequest& request, Time time) {
-  const std::string name = text_untrusted(request.name);
-  fire({name.empty() ? "request" : name, text_untrusted(request.reason),
-        text_untrusted(request.host), time});
+  forget_old();
+  if (fired_at_.size() >= kMaxRemembered) return;  // names that programs make up
+  const std::string name = text_untrusted(request.name), host = text_untrusted(request.host);
+  fire({name.empty() ? "request" : name, text_untrusted(request.reason), host, time}, host);
 }
 
 void TriggerEvaluator::on_lists(const std::vector<StreamInfo>& streams,
@@ -222,7 +224,8 @@ void TriggerEvaluator::on_lists(const std::vector<StreamInfo>& streams,
       if (is_removed || !known.live || rule.kind != Kind::stalled) continue;
       if (!is_about(rule.target, known.id)) continue;
       fire({rule.name, fmt::format("'{}' is lost: its host does not answer", name), known.id.host,
-            now});
+            now},
+           known.id.host);
     }
     known.live = false;
     entry = is_removed ? streams_.erase(entry) : std::next(entry);
@@ -236,13 +239,15 @@ void TriggerEvaluator::check_stream(const TriggerRule& rule, const StreamInfo& s
   if (rule.kind == Kind::stalled && stream.state == StreamState::stalled && before.live) {
     fire({rule.name,
           fmt::format("'{}' is stalled: no sample for {}", stream.id.str(), age_text(stream)),
-          stream.id.host, now});
+          stream.id.host, now},
+         stream.id.str());
   }
   const auto check_crashed = [&](std::uint32_t crashed, std::uint32_t earlier,
                                  const std::string& last) {
     if (rule.kind != Kind::crashed || crashed <= earlier) return;
     fire({rule.name, fmt::format("{} ended without closing '{}'", last, stream.id.str()),
-          stream.id.host, now});
+          stream.id.host, now},
+         stream.id.host + ' ' + last);
   };
   check_crashed(stream.crashed_writers, before.crashed_writers, stream.last_crashed_writer);
   check_crashed(stream.crashed_readers, before.crashed_readers, stream.last_crashed_reader);
@@ -266,20 +271,23 @@ void TriggerEvaluator::check_clocks(const std::vector<HostInfo>& hosts, Time now
       fire({rule.name,
             fmt::format("the clock of host '{}' is not good: {}", host.name,
                         is_own ? status_text(*host.clock) : host.clock_reason),
-            host.name, now});
+            host.name, now},
+           host.name);
     }
   }
   good_clocks_ = std::move(good);
 }
 
-void TriggerEvaluator::fire(RecordedTrigger trigger) {
+void TriggerEvaluator::forget_old() {
+  if (fired_at_.size() < kMaxRemembered) return;
   const MonoTime now = MonoClock::now();
-  if (fired_at_.size() >= kMaxNames) {
-    std::erase_if(fired_at_,
-                  [&](const auto& entry) { return now - entry.second >= min_interval_; });
-    if (fired_at_.size() >= kMaxNames) return;
-  }
-  const auto [last, is_new] = fired_at_.try_emplace(trigger.name, now);
+  std::erase_if(fired_at_, [&](const auto& entry) { return now - entry.second >= min_interval_; });
+}
+
+void TriggerEvaluator::fire(RecordedTrigger trigger, const std::string& subject) {
+  forget_old();
+  const MonoTime now = MonoClock::now();
+  const auto [last, is_new] = fired_at_.try_emplace({trigger.name, subject}, now);
   if (!is_new && now - last->second < min_interval_) return;
   last->second = now;
   fired_.push_back(std::move(trigger));

@@ -7,8 +7,9 @@
 //   TriggerWatch  feeds an evaluator: lists streams and hosts each second, and reads each sample of
 //                 the streams on whose fields there is a condition
 //
-// A trigger fires when its condition begins to hold, for each stream or host by itself, and not
-// again within the minimum interval, so that a value at its limit does not fill the disk.
+// A trigger fires when its condition begins to hold, for each stream, program or host by itself,
+// and not again for the same one within the minimum interval, so that a value at its limit does not
+// fill the disk.
 #pragma once
 
 #include <condition_variable>
@@ -89,7 +90,10 @@ class TriggerEvaluator {
   std::vector<RecordedTrigger> take() { return std::exchange(fired_, {}); }
 
  private:
-  void fire(RecordedTrigger trigger);
+  //   subject  the stream, host or program that it is about
+  void fire(RecordedTrigger trigger, const std::string& subject);
+  // Those after which the minimum interval has passed, when there are many.
+  void forget_old();
   // What the last lists had of a stream.
   struct Known {
     StreamId id;
@@ -101,15 +105,16 @@ class TriggerEvaluator {
                     Time now);
   void check_clocks(const std::vector<HostInfo>& hosts, Time now);
 
-  // Names that requests bring are kept to a limit.
-  static constexpr std::size_t kMaxNames = 1024;
+  // Further requests are ignored while so many triggers are within their minimum interval.
+  static constexpr std::size_t kMaxRemembered = 1024;
 
   std::vector<TriggerRule> rules_;
   Duration min_interval_;
   std::vector<RecordedTrigger> fired_;
-  std::map<std::string, MonoTime> fired_at_;  // by the trigger's name
-  std::map<std::string, Known> streams_;      // by name with host
-  std::map<std::string, bool> good_clocks_;   // of hosts that were up
+  // By the trigger's name and what it was about.
+  std::map<std::pair<std::string, std::string>, MonoTime> fired_at_;
+  std::map<std::string, Known> streams_;     // by name with host
+  std::map<std::string, bool> good_clocks_;  // of hosts that were up
 };
 
 class TriggerWatch {

@@ -279,8 +279,8 @@ Result<void> StreamClient::on_opened(StreamInfo stream, bool) {
   return {};
 }
 
-Result<void> StreamClient::on_subscribed_untrusted(Tid first, bool /*newest_first*/,
-                                                   Tid /*oldest*/) {
+Result<void> StreamClient::on_subscribed_untrusted(Tid first, bool /*newest_first*/, Tid /*oldest*/,
+                                                   Tid /*newest*/) {
   return subscriber_->on_subscribed_untrusted(first);
 }
 

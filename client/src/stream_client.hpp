@@ -106,7 +106,8 @@ class StreamClient final : private wire::FrameDelegate, private channel::Channel
   Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;
   void send(const net::Frame& frame) override { connection_.queue(frame); }
   Result<void> on_opened(StreamInfo stream, bool created) override;
-  Result<void> on_subscribed_untrusted(Tid first, bool newest_first, Tid oldest) override;
+  Result<void> on_subscribed_untrusted(Tid first, bool newest_first, Tid oldest,
+                                       Tid newest) override;
   Result<void> on_gap_untrusted(Tid first, std::uint64_t count) override;
   Result<void> on_published_untrusted(std::int64_t last, Tid last_tid, bool begins) override;
   Result<void> on_refused(channel::ChannelClient::Request request, const Error& why) override;

@@ -128,9 +128,9 @@ Result<void> ChannelClient::on_subscribe_answer(const net::Frame& frame) {
     return Error{Errc::unavailable, "stream '" + id_.str() + "' was recreated just now"};
   }
   reading_ = Reading::filling;
-  return delegate_.on_subscribed_untrusted(frame.subscribed().first_tid(),
-                                           frame.subscribed().newest_first(),
-                                           frame.subscribed().oldest());
+  return delegate_.on_subscribed_untrusted(
+      frame.subscribed().first_tid(), frame.subscribed().newest_first(),
+      frame.subscribed().oldest(), frame.subscribed().newest());
 }
 
 Result<void> ChannelClient::on_publish_answer(const net::Frame& frame) {

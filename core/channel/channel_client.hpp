@@ -112,10 +112,10 @@ class ChannelClient {
     // The stream is open; `stream` is checked, and has the name that was asked for.
     virtual Result<void> on_opened(StreamInfo stream, bool created) = 0;
     // Samples come from now on, beginning with `first`, for
-    // SampleCursor::on_subscribed_untrusted(). newest_first: as it was asked for. oldest: what the
-    // owner's ring holds.
+    // SampleCursor::on_subscribed_untrusted(). newest_first: as it was asked for. oldest and
+    // newest: what the owner's ring holds.
     virtual Result<void> on_subscribed_untrusted(Tid /*first*/, bool /*newest_first*/,
-                                                 Tid /*oldest*/) {
+                                                 Tid /*oldest*/, Tid /*newest*/) {
       return {};
     }
     // All samples that the owner had when it was asked have come.

@@ -265,6 +265,10 @@ Tid SamplePump::first_within(std::size_t bytes, ring::TidRange range) const noex
 }
 
 bool SamplePump::takes_long(ring::TidRange samples) const noexcept {
+  // What a subscription begins with was not written lately, but is as old as the ring.
+  if (samples.begin <= plan_.caught_up_at) {
+    return first_within(kOldInOrderBytes, samples) != samples.begin;
+  }
   const std::size_t in_order =
       std::min(static_cast<std::size_t>(unsent_factor_ * static_cast<double>(kInOrderBytes)),
                kMostUnsentBytes);

@@ -67,9 +67,10 @@ void Mirror::subscribe() {
   channel_.subscribe(request);
 }
 
-Result<void> Mirror::on_subscribed_untrusted(Tid first, bool newest_first, Tid oldest) {
+Result<void> Mirror::on_subscribed_untrusted(Tid first, bool newest_first, Tid oldest, Tid newest) {
   DSSM_TRY(ring_->on_subscribed_untrusted(first, newest_first, oldest));
   is_subscribed_ = true;
+  fresh_from_ = newest;
   log_new_gap();
   last_error_.reset();
   if ((!with_history_ && wants_history()) || max_rate_hz_ != wanted_rate_hz()) subscribe();
@@ -210,7 +211,10 @@ void Mirror::assess_clock() {
 [[gnu::hot]] Result<void> Mirror::on_sample_end(const wire::IncomingSample& sample, bool torn) {
   ring_->end(sample, torn);
   log_new_gap();
-  if (!torn && !std::exchange(is_fresh_, true)) answer_ready();
+  if (!torn && !is_fresh_ && sample.info.tid >= fresh_from_) {
+    is_fresh_ = true;
+    answer_ready();
+  }
   return {};
 }
 

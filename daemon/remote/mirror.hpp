@@ -67,7 +67,8 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
 
   // ChannelClient::Delegate
   Result<void> on_opened(StreamInfo stream, bool created) override;
-  Result<void> on_subscribed_untrusted(Tid first, bool newest_first, Tid oldest) override;
+  Result<void> on_subscribed_untrusted(Tid first, bool newest_first, Tid oldest,
+                                       Tid newest) override;
   Result<void> on_caught_up() override;
   Result<void> on_gap_untrusted(Tid first, std::uint64_t count) override;
   Result<void> on_refused(channel::ChannelClient::Request request, const Error& why) override;
@@ -108,7 +109,8 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
   proto::Mirror::State shown_state() const noexcept;
 
   bool newest_first_ = false;  // the owner has that feature
-  bool is_fresh_ = false;      // a sample has come on this connection
+  Tid fresh_from_ = kNoTid;    // the owner's newest sample when it was asked
+  bool is_fresh_ = false;      // that one, or a newer one, has come on this connection
   bool history_wanted_ = false, history_always_ = false;
   bool with_history_ = false;   // the present subscription, and
   double max_rate_hz_ = 0;      // its rate; 0: all samples

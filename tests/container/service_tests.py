@@ -155,7 +155,7 @@ class ServiceTests:
         wait_until(lambda: self.container.attempt(*asked, "hosts").returncode == 0, "the other dssmd does not answer")
         delays_ms = []
         for signal in ("", "", "", "KILL", "KILL", "KILL"):
-            run(*asked, "clock", "--wait", "60")  # a busy PC takes some rounds to measure the pair
+            run(*asked, "clock", "--wait", "60")  # a busy PC takes some heartbeats to measure the pair
             with subprocess.Popen(
                     ["nsenter", f"--target={self.container.environment['DSSM_CONTAINER']}", "--all", "dssmctl",
                      "--socket", f"{other}/dssmd.sock", "--json", "delay", "speed", "--wait", "10", "-i", "2.5",

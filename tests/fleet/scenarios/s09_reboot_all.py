@@ -2,13 +2,14 @@
 """All PCs reboot at once and form a vehicle again without help
 
 dssmd, chronyd, Avahi and a sensor program start at the boot of each PC, in any order. Then each PC
-passes `dssmctl doctor` and lists all sensors.
+passes `dssmctl doctor`, accepts the clocks of all others, and lists all sensors.
 """
 
+import json
 import time
 
 from lab.guest import Guest
-from lab.lab import Lab, await_that
+from lab.lab import GUESTS, Lab, await_that
 from lab.load import Load
 
 UNIT = "fleet-sensor"
@@ -38,12 +39,16 @@ def run(lab: Lab) -> None:
 
 
 def await_healthy(guest: Guest) -> None:
-    """Waits until doctor finds no error: after the boot, clocks are refused for some seconds."""
+    """Waits until doctor finds no error and reads by time accept all others: after the boot they are refused for
+    some seconds."""
     def check() -> tuple[bool, object]:
         if not guest.answers():
             return False, "no answer yet"
-        done = guest.ssh.attempt("dssmctl doctor")
-        return done.returncode == 0, done.stdout.decode(errors="replace")
+        done = guest.ssh.attempt("dssmctl doctor >&2 && dssmctl clock --wait 0 >&2 && dssmctl hosts --json")
+        if done.returncode:
+            return False, done.stderr.decode(errors="replace")
+        states = [host["state"] for host in json.loads(done.stdout)["hosts"]]
+        return states.count("up") == GUESTS - 1, states
 
     await_that(f"{guest.name} passes dssmctl doctor", check)
 

@@ -55,12 +55,20 @@ TEST_F(Clock, HasNoMatrixWithoutAnotherHost) {
   EXPECT_EQ(lines[1], "no other host is up, so there is no pair; see `dssmctl hosts`");
 }
 
+TEST_F(Clock, IsWaitedForUntilReadsByTimeAcceptTheOthersSamples) {
+  for (const char* host : {"pc2", "pc3"}) await_state(host, HostState::up);
+  const Finished finished = ctl({"clock", "--wait", "60"});
+  EXPECT_EQ(finished.exit_status, 0) << "without a chronyd, by what was measured: " << finished.err;
+}
+
 TEST_F(Clock, IsWaitedForAndReportsWhyItFailed) {
+  for (DaemonProcess* daemon : {&pc2_, &pc3_}) daemon->kill_hard();
+  for (const char* host : {"pc2", "pc3"}) await_state(host, HostState::down);
   clocks();
   Running waiting({dssmctl_path(), "clock", "--wait", "1000"}, {daemon_.environment()});
   EXPECT_TRUE(
-      waiting.line().starts_with("dssmctl: clock: waits up to 16m40s: the clock of this "
-                                 "host is unknown: no chronyd; see `chronyc"));
+      waiting.line().starts_with("dssmctl: clock: waits up to 16m40s: no other host is up, and the "
+                                 "clock of this host is unknown: no chronyd; see `chronyc"));
   waiting.signal(SIGINT);
   EXPECT_EQ(waiting.status(), 1);
   const Finished finished = ctl({"clock", "--wait", "0"});

@@ -83,6 +83,19 @@ TEST_F(RecordingFolderTest, NeverDeletesTheNewest) {
   EXPECT_EQ(files(), std::set<std::string>{"dssm_2026_11_27-13_00_00.mcap"});
 }
 
+// As on a PC whose battery was flat, until chronyd sets the clock.
+TEST_F(RecordingFolderTest, DeletesWhatWasThereFirstAlsoIfTheClockIsBehind) {
+  add("dssm_2026_11_27-12_00_00.mcap", 300, 3h);
+  add("dssm_2026_11_27-13_00_00.mcap", 300, 2h);
+  RecordingFolder folder(path_, 1000);
+  ASSERT_TRUE(folder.make_room(0));
+  EXPECT_EQ(files().size(), 2U);
+  add("dssm_2020_01_01-00_00_00.mcap", 300, 50'000h);
+  ASSERT_TRUE(folder.make_room(300));
+  EXPECT_EQ(files(), (std::set<std::string>{"dssm_2026_11_27-13_00_00.mcap",
+                                            "dssm_2020_01_01-00_00_00.mcap"}));
+}
+
 TEST_F(RecordingFolderTest, WithoutAQuotaDeletesNothingButNoticesThatTheFolderIsMissing) {
   add("dssm_2026_11_27-12_00_00.mcap", 300, 3h);
   add("dssm_2026_11_27-13_00_00.mcap", 300, 2h);

@@ -157,7 +157,8 @@ HostInfo host(const std::string& name, HostState state, const std::string& clock
 
 class Lists {
  public:
-  explicit Lists(const std::string& text) : evaluator_({rule(text)}, Duration::zero()) {}
+  explicit Lists(const std::string& text, Duration min_interval = Duration::zero())
+      : evaluator_({rule(text)}, min_interval) {}
   std::vector<RecordedTrigger> show(const std::vector<StreamInfo>& streams,
                                     const std::vector<HostInfo>& hosts = {
                                         host("pc1", HostState::self)}) {
@@ -226,6 +227,19 @@ TEST(TriggerEvaluator, FiresForEachReaderThatCrashes) {
   ASSERT_EQ(fired.size(), 1U);
   EXPECT_EQ(fired[0].reason, "localizer (pid 34) ended without closing 'a:0@pc1'");
   EXPECT_TRUE(lists.show({a}).empty());
+}
+
+TEST(TriggerEvaluator, HasAMinimumIntervalForEachProgramByItself) {
+  Lists lists("crashed", 1h);
+  StreamInfo a = stream("a", StreamState::live), b = stream("b", StreamState::live);
+  lists.show({a, b});
+  ++a.crashed_writers;
+  EXPECT_EQ(lists.show({a, b}).size(), 1U);
+  ++b.crashed_readers;
+  b.last_crashed_reader = "localizer (pid 34)";
+  EXPECT_EQ(lists.show({a, b}).size(), 1U) << "of another program";
+  ++a.crashed_writers;
+  EXPECT_TRUE(lists.show({a, b}).empty());
 }
 
 TEST(TriggerEvaluator, RemembersTheCrashesOfAHostThatWasAway) {

@@ -40,7 +40,7 @@ struct ChannelClientTest : testing::Test, ChannelClient::Delegate {
     opened = std::move(stream);
     return {};
   }
-  Result<void> on_subscribed_untrusted(Tid tid, bool, Tid) override {
+  Result<void> on_subscribed_untrusted(Tid tid, bool, Tid, Tid) override {
     first = tid;
     return {};
   }

@@ -1180,6 +1180,7 @@ TEST_F(SmallBacklog, EachSampleIsSentOrLostOnce) {
 }
 
 TEST_F(ManySmall, HistoryComesNewestFirstAndBacklogInItsOrder) {
+  rig.peer.progress.emplace();  // of a connection that has sent everything
   const Tid newest = kDepth / 2;
   rig.write(newest + 1);
   start({0, newest, 0});
