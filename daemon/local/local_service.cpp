@@ -173,10 +173,13 @@ Result<void> LocalService::check_access(const ClientIdentity& client,
   return checked;
 }
 
-// Whether a Create of `id` finds the stream; without a host it is searched here only.
+// Whether a Create of `id` may find the stream; without a host it is searched here only. Who may
+// not create it waits until that is known, and then joins it or is refused.
 bool LocalService::exists(const StreamId& id) const {
-  if (id.host.empty() || id.host == registry_.host()) return registry_.knows(id);
-  return fleet_ && fleet_->is_there(id);
+  if (id.host.empty() || id.host == registry_.host()) {
+    return registry_.knows(id) || registry_.may_come_back(id);
+  }
+  return fleet_ != nullptr;
 }
 
 bool LocalService::is_only_user(const ClientIdentity& client, const StreamId& id) const {

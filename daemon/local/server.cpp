@@ -12,6 +12,7 @@
 #include <algorithm>
 #include <cerrno>
 #include <cstring>
+#include <iterator>
 #include <new>
 #include <span>
 #include <utility>
@@ -382,6 +383,11 @@ void Connection::end_with(const Error& error) {
 
 void Connection::close_socket() {
   std::vector<UniqueFd> group = std::exchange(unchecked_, {});
+  // Freeing a large memory file takes long, too.
+  for (std::vector<UniqueFd>& some : std::exchange(arrived_, {})) {
+    group.insert(group.end(), std::make_move_iterator(some.begin()),
+                 std::make_move_iterator(some.end()));
+  }
   UniqueFd socket = std::move(socket_);
   if (end_with_unread(socket.get())) group.push_back(std::move(socket));
   if (!group.empty()) user_.closer.close(std::move(group));
@@ -397,7 +403,6 @@ void Connection::close(bool by_client) {
   output_timer_.disable();
   close_socket();
   output_.clear();
-  arrived_.clear();
   input_share_ = {};
   output_share_ = {};
   by_client_ = by_client;

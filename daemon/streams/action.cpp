@@ -54,8 +54,9 @@ std::string Identity::account() const {
 
 std::string account_of(const std::string& address, const wire::CertifiedPeer* certified) {
   if (certified) return certified->str();
-  // A program may use each of 127.0.0.1 to 127.255.255.254.
-  const bool is_this_pc = address.starts_with("127.") || address.starts_with("[::ffff:127.");
+  // A program may use each of 127.0.0.1 to 127.255.255.254, and ::1.
+  const bool is_this_pc = address.starts_with("127.") || address.starts_with("[::ffff:127.") ||
+                          address.starts_with("[::1]");
   return in_quotes(is_this_pc ? "127.0.0.1" : address.substr(0, address.rfind(':')));
 }
 

@@ -490,6 +490,17 @@ TEST_F(RemoteRightsTest, CountWhenTheHostIsKnown) {
   EXPECT_EQ(fleet.writer_plan->scope, CreatePlan::Scope::join);
 }
 
+TEST_F(RemoteRightsTest, OfAWriterWaitForTheHost) {
+  fleet.knows_hosts = false;
+  allow("user:1000 write lidar");
+  put(create_at("pc2"));
+  EXPECT_TRUE(client->received.empty()) << "nobody knows what pc2 has";
+  ASSERT_EQ(fleet.waiting.size(), 1u);
+  fleet.waiting[0]();
+  ASSERT_TRUE(fleet.writer_plan);
+  EXPECT_EQ(fleet.writer_plan->scope, CreatePlan::Scope::join);
+}
+
 // The catalog still had it.
 TEST_F(RemoteRightsTest, SayWhyAStreamThatHasGoneIsNotCreated) {
   fleet.there = {"lidar:0@pc2"};

@@ -95,6 +95,15 @@ TEST_F(ActionTest, RefusesEachRequestOfALocalProgram) {
   EXPECT_EQ(late.next().failure().code(), "no_permission");
 }
 
+TEST(Account, IsOneForAllAddressesOfThisPc) {
+  for (const char* address :
+       {"127.0.0.1:40000", "127.9.9.9:1", "[::ffff:127.0.0.3]:1", "[::1]:40000"}) {
+    EXPECT_EQ(account_of(address, nullptr), "'127.0.0.1'") << address;
+  }
+  EXPECT_EQ(account_of("[fd00::1]:40000", nullptr), "'[fd00::1]'");
+  EXPECT_NE(account_of("10.0.0.2:40000", nullptr), account_of("10.0.0.3:40000", nullptr));
+}
+
 TEST_F(ActionTest, RefusesEachRequestOfAnotherHost) {
   ServerRig rig({16, 8, 32U << 20}, nullptr, &rule);
   rig.create("odometry");

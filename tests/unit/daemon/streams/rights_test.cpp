@@ -201,6 +201,17 @@ TEST_F(LocalRightsTest, CountWhenARequestThatHasWaitedIsServed) {
   EXPECT_EQ(refused.failure().code(), "no_permission") << refused.failure().message();
 }
 
+TEST_F(LocalRightsTest, OfAWriterWaitForAStreamThatMayComeBack) {
+  registry.begin_recovery(Registry::Recovery::streams);
+  set({"user:1000 write lidar"});
+  local::Request create = daemon::create_request("lidar");
+  create.set_serial(50);
+  ASSERT_TRUE(client.put(create));
+  EXPECT_TRUE(client.received.empty()) << "the stream may still be offered";
+  registry.end_recovery();
+  EXPECT_EQ(client.next().failure().code(), "no_permission") << "it was not";
+}
+
 TEST_F(LocalRightsTest, ListsAndEventsShowWhatTheAskerMaySee) {
   ASSERT_TRUE(client.ask(daemon::create_request("lidar")).has_opened());
   ASSERT_TRUE(client.ask(daemon::create_request("secret")).has_opened());
