@@ -305,8 +305,10 @@ void add_clock(CLI::App& app, Parsed& parsed) {
                                  "average, maximum, minimum and standard deviation of N readings, "
                                  "one a second",
                                  options.table, 1, kMaxWindow);
-  add_seconds(clock, "--wait", "until reads by time accept the samples of all hosts that are up, for so long at most", options.wait,
-              Range::not_negative)
+  add_seconds(
+      clock, "--wait",
+      "until reads by time accept the samples of all hosts that are up, for so long at most",
+      options.wait, Range::not_negative)
       ->excludes(watch)
       ->excludes(matrix)
       ->excludes(table);

@@ -50,8 +50,8 @@ class SamplePump {
   // sample; more when the network carries more in that time. Of small samples all, when the kernel
   // has sent everything: then hundreds wait because this PC is busy, and not for the network.
   static constexpr std::size_t kInOrderBytes = 64U << 10;
-  // Of what was there when the subscription began only so much: 4 ms where the network carries
-  // 1 MB/s.
+  // Of what was there when the subscription began only so much, or what the network carries in
+  // kInOrderFor: as many at 1 MB/s.
   static constexpr std::size_t kOldInOrderBytes = 4U << 10;
   static constexpr Duration kInOrderFor = std::chrono::milliseconds(4);
   static constexpr Duration kSmallInOrderFor = std::chrono::milliseconds(20);

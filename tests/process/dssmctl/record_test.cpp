@@ -704,7 +704,7 @@ TEST_F(Play, PlaysAPartUnderAnotherName) {
 
 TEST_F(Play, RefusesAMappingThatAppliesToNoStream) {
   make_recording();
-  for (const std::vector<std::string> mappings :
+  for (const std::vector<std::string>& mappings :
        {std::vector<std::string>{"pos=copy"}, {"pose=copy", "po*=second"}}) {
     std::vector<std::string> words = {"play", file_};
     for (const std::string& mapping : mappings) words.insert(words.end(), {"--map", mapping});

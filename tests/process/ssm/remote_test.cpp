@@ -27,9 +27,7 @@ TEST_P(SsmRemoteProgram, ChecksHold) { expect_checks_hold(GetParam(), true); }
 
 class SsmRemoteProcesses : public testing::TestWithParam<std::string> {};
 
-TEST_P(SsmRemoteProcesses, ChecksHold) {
-  expect_checks_hold(GetParam(), true);
-}
+TEST_P(SsmRemoteProcesses, ChecksHold) { expect_checks_hold(GetParam(), true); }
 
 INSTANTIATE_TEST_SUITE_P(Cpp, SsmRemoteProgram,
                          testing::Values("remote_api-c++11", "remote_api-c++14", "remote_api-c++17",

@@ -320,9 +320,9 @@ TEST(Doctor, SaysWhatABadClockMeansForReads) {
   Facts alone = facts, refused = facts;
   alone.hosts.pop_back();
   refuse(refused, "this PC's clock is out of bounds");
-  const auto expect = [](Facts facts, const std::string& policy, const std::string& words) {
-    facts.daemon.clock_policy = policy;
-    const std::string text = finding_of(facts, "clock").text;
+  const auto expect = [](Facts with, const std::string& policy, const std::string& words) {
+    with.daemon.clock_policy = policy;
+    const std::string text = finding_of(with, "clock").text;
     EXPECT_NE(text.find(words), std::string::npos) << text;
   };
   const std::string marked = "clock_policy = \"mark\" in /etc/pc1.conf";
