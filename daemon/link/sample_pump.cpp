@@ -265,20 +265,18 @@ Tid SamplePump::first_within(std::size_t bytes, ring::TidRange range) const noex
 }
 
 bool SamplePump::takes_long(ring::TidRange samples) const noexcept {
-  const std::optional<wire::Progress> progress = connection_.progress();
   // What a subscription begins with was not written lately, but is as old as the ring.
-  if (samples.begin <= plan_.caught_up_at) {
-    const std::uint64_t carried = progress ? progress->carried_bytes_per_s : 0;
-    const std::size_t most = std::max(kOldInOrderBytes, bytes_in(kInOrderFor, carried));
-    return first_within(most, samples) != samples.begin;
-  }
+  const bool is_old = samples.begin <= plan_.caught_up_at;
   const std::size_t in_order =
-      std::min(static_cast<std::size_t>(unsent_factor_ * static_cast<double>(kInOrderBytes)),
-               kMostUnsentBytes);
+      is_old
+          ? kOldInOrderBytes
+          : std::min(static_cast<std::size_t>(unsent_factor_ * static_cast<double>(kInOrderBytes)),
+                     kMostUnsentBytes);
   if (first_within(in_order, samples) == samples.begin) return false;
+  const std::optional<wire::Progress> progress = connection_.progress();  // a system call
   if (!progress) return true;
-  if (!has_pace() && progress->unsent_bytes == 0) return false;
-  const Duration time = has_pace() ? kInOrderFor : kSmallInOrderFor;
+  if (!is_old && !has_pace() && progress->unsent_bytes == 0) return false;
+  const Duration time = has_pace() || is_old ? kInOrderFor : kSmallInOrderFor;
   return first_within(bytes_in(time, progress->carried_bytes_per_s), samples) != samples.begin;
 }
 
