@@ -115,6 +115,27 @@ Finding check_mirrors(const Facts& facts) {
                       shell_word(example))};
 }
 
+// Streams of hosts whose clocks are good, whose times are not: other hosts write to them, or a
+// stricter limit is set for them.
+Finding check_times(const Facts& facts) {
+  std::vector<std::string> reasons;
+  for (const StreamInfo& stream : facts.streams) {
+    if (!stream.mirror || stream.mirror->clock.empty()) continue;
+    const bool is_known = std::ranges::any_of(facts.hosts, [&](const HostInfo& host) {
+      return host.name == stream.id.host && !host.clock_reason.empty();
+    });
+    if (!is_known) reasons.push_back(stream.mirror->clock);
+  }
+  if (reasons.empty()) {
+    return {"times", Status::ok,
+            "those of all streams that are read here are as good as their hosts' clocks"};
+  }
+  return {"times", Status::fail, "not good here: " + first_of(std::move(reasons)),
+          "reads by time of these streams are refused, unless clock_policy or clock_streams only "
+          "marks them",
+          "dssmctl clock  # on this PC, on the streams' hosts and where their writers run"};
+}
+
 // Rings that hold less of the past than their creators asked for: they are written more often than
 // with the cycle that was stated.
 Finding check_histories(const Facts& facts) {
@@ -171,6 +192,7 @@ void check_streams(const Facts& facts, std::vector<Finding>& findings) {
   findings.push_back(check_stream_names(facts));
   findings.push_back(check_stalled(facts));
   findings.push_back(check_mirrors(facts));
+  findings.push_back(check_times(facts));
   findings.push_back(check_histories(facts));
   findings.push_back(check_types(facts));
 }

@@ -127,6 +127,8 @@ void FleetClock::on_host_clock(const KnownHost& host) {
     if (host.greeting.clock->heartbeat) clock_generation();
     measure(*host.greeting.clock);
   }
+  const bool is_good = reason_against(host.greeting.clock.get()).empty();
+  if (log_.is_changed(host.greeting.host_id, is_good)) log_others(MonoClock::now());
   // The reports of others are used at the latest with the next answer of chronyd.
   if (source_ && host.greeting.host_id == source_->id) refresh();
   poll_if_due();
@@ -594,7 +596,10 @@ std::string FleetClock::reason_against(const wire::ClockReport* owner) const {
 // sample's clock error is against the anchor, which may be further away than its writer.
 Duration FleetClock::distance_of_samples(const wire::ClockReport& owner) const {
   const MonoTime now = MonoClock::now();
-  const SampleInfo latest{0, Time::max(), owner.at(now).clock.bound};  // after measured_from
+  // After measured_from, except on a clock that was set back and shows times from before it.
+  const Time wall = WallClock::now();
+  const bool is_before = owner.settled_from == Time() && owner.setting_from > wall;
+  const SampleInfo latest{0, is_before ? wall : Time::max(), owner.at(now).clock.bound};
   return assess_mirror({}, &owner).distance(latest, now);
 }
 

@@ -29,4 +29,21 @@ void HostClockLog::update(const wire::HostId& id, const std::string& name,
                   {.message_id = message_id::kHostClockOutOfBounds});
 }
 
+bool HostClockLog::is_changed(const wire::HostId& id, bool is_good) const {
+  const auto found = hosts_.find(id);
+  return found != hosts_.end() && found->second.logged_bad == is_good;
+}
+
+void HostClockLog::forget(const wire::HostId& id) {
+  const auto found = hosts_.find(id);
+  if (found == hosts_.end()) return;
+  Seen& seen = found->second;
+  if (!seen.logged_bad || hosts_.size() > kMaxHosts) {
+    hosts_.erase(found);
+    return;
+  }
+  seen.was_good = false;
+  seen.bad_since.reset();
+}
+
 }  // namespace dssm::daemon

@@ -26,8 +26,11 @@ class HostClockLog {
   // reason: why the times of its samples are not good here; empty: they are.
   void update(const wire::HostId& id, const std::string& name, const std::string& reason,
               MonoTime now);
-  // It is not connected any more, which is logged elsewhere.
-  void forget(const wire::HostId& id) { hosts_.erase(id); }
+  // Whether update() may log that: it is not what was logged last.
+  bool is_changed(const wire::HostId& id, bool is_good) const;
+  // It is not connected any more, which is logged elsewhere. What was logged as bad is logged when
+  // it is good again.
+  void forget(const wire::HostId& id);
 
  private:
   struct Seen {
@@ -36,6 +39,9 @@ class HostClockLog {
     std::optional<MonoTime> bad_since;  // nothing: it is good
     RateLimiter pace{4, std::chrono::minutes(1)};
   };
+
+  // Each boot of a host has another id.
+  static constexpr std::size_t kMaxHosts = 256;
 
   Logger& logger_;
   std::map<wire::HostId, Seen> hosts_;

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/remote/mirror_ring.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <cstring>
 #include <new>
@@ -374,13 +376,25 @@ Result<void> MirrorClock::check_opening() const {
   if (!has_report_) return {};
   const ring::ClockAssessment now = assess(has_other_clocks_ != true);
   if (now.policy != ClockPolicy::enforce || now.can_be_good()) return {};
-  return assessor_->refusal(id_, report_.get());
+  return refusal();
+}
+
+Error MirrorClock::refusal() const {
+  if (has_other_clocks_ != true || !assess(true).can_be_good()) {
+    return assessor_->refusal(id_, report_.get());
+  }
+  return Error{
+      Errc::clock_out_of_bounds,
+      fmt::format("stream '{}': programs on other PCs write to it, so only what chronyd states "
+                  "there, on its host and here counts, not what was measured between two PCs; run "
+                  "`dssmctl clock` on them, or set the key clock_policy to \"mark\" or \"off\"",
+                  id_.str())};
 }
 
 std::string MirrorClock::reason() const {
   const ring::ClockAssessment now = assess(has_other_clocks_ != true);
   if (now.policy == ClockPolicy::off || now.can_be_good()) return {};
-  return assessor_->refusal(id_, report_.get()).message;
+  return refusal().message;
 }
 
 }  // namespace dssm::daemon

@@ -174,6 +174,7 @@ class MirrorClock {
   std::string reason() const;
 
  private:
+  Error refusal() const;
   // Of a clock that was set back: which samples are of that setting.
   struct Settled {
     std::int64_t setting = 0;

@@ -232,6 +232,17 @@ class Truth:
                 for each in refused if bisect.bisect_left(far, each.came - NEAR_SECONDS * SECOND_NS)
                 == bisect.bisect_right(far, each.came)]
 
+    def unnoticed_steps(self, reader: str) -> list[tuple[int, float]]:
+        """From when to when the dssmd there may not have noticed that its clock was set: until reads are refused."""
+        refused = sorted(each.came for run in self.watched[reader].runs.values() for each in run.observations
+                         if any(each.status_of(owner) == "clock_out_of_bounds" for owner in each.answer["others"]))
+        spans = []
+        for step in self.watched[reader].steps:
+            index = bisect.bisect_right(refused, step)
+            first = refused[index] if index < len(refused) else math.inf
+            spans.append((step, min(first, step + NOTICE_NS)))
+        return spans
+
     def longest_silence(self) -> float:
         """The longest time [s] in which a guest did not answer: because this machine is busy, for example."""
         return max(after.came - before.came for watched in self.watched.values() for run in watched.runs.values()
@@ -348,8 +359,8 @@ class Truth:
 
 # Reads by time; of the newest sample; and of all others' samples together.
 KINDS = ("by_time", "newest", "joint")
-# Just after this PC's clock was set, a program may read the time before dssmd has noticed the step:
-# docs/clocks.md "What is not covered".
+# Just after this PC's clock was set, a program may read the time before dssmd has noticed the step, which
+# is when reads there are refused: docs/clocks.md "What is not covered". At most:
 NOTICE_NS = 0.25 * SECOND_NS
 # And after its last answer, chronyd may have slewed a wrong clock for a second at its maxslewrate
 # (83,333 ppm); same section. The times of such a clock are never accepted.
@@ -370,13 +381,13 @@ def expect_true(truth: Truth) -> None:
     wrong = [each for each in stated if each.is_false(
         each.stated + (SLEWED_NS if not each.good and is_slewed(truth, each) else 0))]
     wrong += [each for each in good if not 0 <= each.stated <= LIMIT_NS or each.is_false(LIMIT_NS)]
-    unnoticed = [(each.came - step) / 1e6 for each in wrong for step in truth.watched[each.reader].steps
-                 if 0 <= each.came - step < NOTICE_NS]
-    if unnoticed:
-        print(f"  | on the PC whose clock was set, {len(unnoticed)} statements were wrong before its dssmd noticed, the"
-              f" last one {max(unnoticed):.1f} ms after that", flush=True)
-    wrong = [each for each in wrong if not any(0 <= each.came - step < NOTICE_NS
-                                               for step in truth.watched[each.reader].steps)]
+    unnoticed = {reader: truth.unnoticed_steps(reader) for reader in truth.watched}
+    late = {id(each): each.came - begin for each in wrong for begin, end in unnoticed[each.reader]
+            if begin <= each.came <= end}
+    if late:
+        print(f"  | on the PC whose clock was set, {len(late)} statements were wrong before its dssmd noticed, the"
+              f" last one {max(late.values()) / 1e6:.1f} ms after that", flush=True)
+    wrong = [each for each in wrong if id(each) not in late]
     groups: dict[tuple[str, str, bool], list[Checked]] = {}
     for each in wrong:
         groups.setdefault((each.reader, each.owner, each.good), []).append(each)

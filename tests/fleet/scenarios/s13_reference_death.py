@@ -25,6 +25,7 @@ def run(lab: Lab) -> None:
         print(f"  | without the reference: the successor followed after {(time.monotonic_ns() - died) / SECOND_NS:.1f} s;"
               f" of the reads between the others {100 * truth.share_good('pc2', 'pc3', died):.1f} and"
               f" {100 * truth.share_good('pc3', 'pc2', died):.1f} % good", flush=True)
+        expect_no_refusals(truth, died)
         with lab.timing.step(PART + "boot pc1"), lab.spread():
             pc1.power_on(lab.all_cores)
             pc1.await_running()
@@ -34,6 +35,13 @@ def run(lab: Lab) -> None:
         print(f"  | the reference back: good {(good - back) / SECOND_NS:.1f} s after its boot", flush=True)
         await_reference(pc3, "pc1")
         truth.await_good()
+        expect_no_refusals(truth, died)
     expect_true(truth)
     lab.on_all(lambda guest: guest.ssh.run("dssmctl rm truth"))
     lab.await_streams()
+
+
+def expect_no_refusals(truth: Truth, since: int) -> None:
+    """The two others read each other all the time, while their clocks were near each other."""
+    refused = truth.refused_while_near("pc2", "pc3", since) + truth.refused_while_near("pc3", "pc2", since)
+    assert not refused, refused[:5]

@@ -46,7 +46,7 @@ def run(lab: Lab) -> None:
     with Truth(lab.guests).watching() as truth:
         truth.await_good()
         while True:
-            faults = [(guest, fault) for guest in lab.guests for fault in faults_of(guest, order)
+            faults = [(guest, fault) for guest in lab.guests for fault in faults_of(guest)
                       if FAULTS.search(f"{guest.name}: {fault[0]}")]
             order.shuffle(faults)
             # These guests have no battery's clock. At a resume their kernel takes what the wall clock was set by
@@ -94,16 +94,14 @@ def spread_us(values: list[float]) -> str:
     return f"median {statistics.median(values):.0f} us, max {max(values):.0f} us"
 
 
-def faults_of(guest: Guest, order: random.Random) -> Iterator[Fault]:
+def faults_of(guest: Guest) -> Iterator[Fault]:
     """The faults of one PC."""
     number = guest.number
     others = [each for each in (1, 2, 3) if each != number]
     is_reference = number == 1
-    for size in SMALL_STEPS_NS:
-        ns = size * order.choice((-1, 1))
+    for ns in (sign * size for size in SMALL_STEPS_NS for sign in (-1, 1)):
         yield f"set by {ns / 1e6} ms", step(guest, ns), not is_reference
-    for size in LARGE_STEPS_NS:
-        ns = size * order.choice((-1, 1))
+    for ns in (sign * size for size in LARGE_STEPS_NS for sign in (-1, 1)):
         yield f"set by {ns / 1e9:.0f} s and back", step_and_back(guest, ns), not is_reference
     yield "chronyd killed", chronyd_killed(guest), True
     yield "chronyd stopped", chronyd_stopped(guest), True

@@ -501,6 +501,19 @@ TEST(Doctor, FindsStreamsOfOneNameAndNamesOnlySome) {
   EXPECT_TRUE(finding_of(facts, "stream names").text.ends_with(" and 96 more"));
 }
 
+TEST(Doctor, FindsStreamsWhoseTimesAreNotGoodThoughTheirHostsClocksAre) {
+  Facts facts = healthy();
+  StreamInfo& stream = facts.streams[1];
+  EXPECT_FINDING(facts, "times", Status::ok, "");
+  stream.mirror.emplace();
+  EXPECT_FINDING(facts, "times", Status::ok, "");
+  stream.mirror->clock = "programs on other PCs write to it";
+  EXPECT_FINDING(facts, "times", Status::fail, "dssmctl clock");
+  EXPECT_EQ(finding_of(facts, "times").text, "not good here: programs on other PCs write to it");
+  facts.hosts[1].clock_reason = "2 ms apart";  // which is a finding of its own
+  EXPECT_FINDING(facts, "times", Status::ok, "");
+}
+
 TEST(Doctor, FindsRingsThatKeepLessThanTheyWereCreatedFor) {
   Facts facts = healthy();
   StreamInfo& stream = facts.streams[0];

@@ -412,6 +412,20 @@ TEST_F(MeasuredTest, TimesFromBeforeAStepThereAreNotMeasured) {
   EXPECT_EQ(fleet->assess_mirror(lidar, later.get()).recent_from, later->setting_from);
 }
 
+// So are the samples that it writes for an hour: what is stated of the host is what readers do.
+TEST_F(MeasuredTest, AClockThatWasSetBackIsRefusedAsItsSamplesAre) {
+  start();
+  heartbeat(0us);
+  EXPECT_FALSE(fleet->clock_pairs().at(0).refused);
+  pc3 = std::make_shared<wire::ClockReport>(*pc3);
+  pc3->setting_from = WallClock::now() + 1h;
+  catalog.set_clock(kOther, pc3);
+  const ClockPair pair = fleet->clock_pairs().at(0);
+  const SampleInfo sample{0, WallClock::now(), pc3->clock.bound};
+  EXPECT_GT(fleet->assess_mirror(lidar, pc3.get()).distance(sample, MonoClock::now()), pair.limit);
+  EXPECT_TRUE(pair.refused);
+}
+
 // For an hour it shows times that it showed before.
 TEST_F(MeasuredTest, OfAClockThatWasSetBackNewSamplesAreToldFromEarlierOnesByTheirTids) {
   set_by = 1h;

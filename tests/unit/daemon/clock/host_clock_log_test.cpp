@@ -55,6 +55,21 @@ TEST_F(HostClockLogTest, DistinguishesHostsAndForgetsThem) {
   log.forget(kFirst);
   log.update(kFirst, "pc1", kReason, kBegin + 2s);
   EXPECT_EQ(lines.size(), 1U) << "a host that comes back has just started";
+  log.update(kFirst, "pc1", "", kBegin + 3s);
+  EXPECT_EQ(lines.size(), 2U) << "it was logged as bad before it left";
+  log.forget(kFirst);
+  log.update(kFirst, "pc1", "", kBegin + 4s);
+  EXPECT_EQ(lines.size(), 2U);
+}
+
+TEST_F(HostClockLogTest, KnowsWhatItWouldLog) {
+  EXPECT_FALSE(log.is_changed(kFirst, true));
+  log.update(kFirst, "pc1", "", kBegin);
+  EXPECT_FALSE(log.is_changed(kFirst, true));
+  EXPECT_TRUE(log.is_changed(kFirst, false));
+  log.update(kFirst, "pc1", kReason, kBegin + 1s);
+  EXPECT_FALSE(log.is_changed(kFirst, false));
+  EXPECT_TRUE(log.is_changed(kFirst, true));
 }
 
 TEST_F(HostClockLogTest, IsNotFilledByAClockThatComesAndGoes) {

@@ -176,6 +176,9 @@ TEST_F(MirrorClockTest, SamplesThatOtherHostsWriteAreNotMeasured) {
   EXPECT_EQ(clock.assessment().measured, kUnknownClockError);
   EXPECT_EQ(clock.assessment().recent, kUnknownClockError);
   EXPECT_FALSE(clock.check_opening());
+  EXPECT_NE(clock.reason().find("programs on other PCs write to it"), std::string::npos);
+  assessor.measured = kUnknownClockError;
+  EXPECT_EQ(clock.reason(), "not 'lidar:0@pc2'") << "not because of those";
 }
 
 TEST_F(MirrorClockTest, ClockErrorsFromBeforeASlewAreSuspect) {
