@@ -417,9 +417,10 @@ TEST_F(MeasuredTest, AClockThatWasSetBackIsRefusedAsItsSamplesAre) {
   start();
   heartbeat(0us);
   EXPECT_FALSE(fleet->clock_pairs().at(0).refused);
-  pc3 = std::make_shared<wire::ClockReport>(*pc3);
-  pc3->setting_from = WallClock::now() + 1h;
-  catalog.set_clock(kOther, pc3);
+  auto later = std::make_shared<wire::ClockReport>(*pc3);
+  later->setting_from = WallClock::now() + 1h;
+  later->heartbeat.reset();
+  catalog.set_clock(kOther, pc3 = later);
   const ClockPair pair = fleet->clock_pairs().at(0);
   const SampleInfo sample{0, WallClock::now(), pc3->clock.bound};
   EXPECT_GT(fleet->assess_mirror(lidar, pc3.get()).distance(sample, MonoClock::now()), pair.limit);
