@@ -41,6 +41,7 @@
 #include "daemon/remote/remote_writer.hpp"
 #include "daemon/serve/data_communicator.hpp"
 #include "daemon/serve/peer_table.hpp"
+#include "daemon/serve/stream_channel.hpp"
 #include "daemon/service/config.hpp"
 #include "daemon/streams/descriptor_store.hpp"
 #include "daemon/streams/stream.hpp"
@@ -168,6 +169,7 @@ Values values_of_the_code() {
       DSSM_BYTES(wire::FrameDecoder::kCollectedPerReceive),
       DSSM_COUNT(FrameConnection::kReceivesPerTurn),
       DSSM_BYTES(SamplePump::kBytesPerTurn),
+      DSSM_COUNT(StreamChannel::kMaxFinds),
       DSSM_COUNT(SamplePump::kSamplesPerTurn),
       DSSM_COUNT(Acceptor::kConnectionsPerTurn),
       DSSM_COUNT(Peers::kMaxFoundHosts),

@@ -4,6 +4,10 @@
 // end.
 #include "daemon/serve/stream_channel.hpp"
 
+#include <algorithm>
+#include <ctime>
+#include <iterator>
+#include <new>
 #include <thread>
 
 #include "tests/unit/daemon/remote/fake_clock_assessor.hpp"
@@ -149,6 +153,60 @@ TEST_F(StreamChannelTest, ReportsItsRange) {
   EXPECT_EQ(range.at_tid(), 15);
   frame.mutable_get_range()->clear_time_ns();
   EXPECT_EQ(ask(frame).at(0).range().at_tid(), -1);
+}
+
+// Runs whose links never end, as a hostile writer makes them: each search gives up.
+class SearchWithoutEnd : public StreamChannelTest {
+ protected:
+  void SetUp() override {
+    rig.connect(peer);
+    stream = rig.create("runs", kBytes, 1024);
+    rig.write(*stream, 600);
+    const OfferedFiles files = as_offer(stream->descriptors_for(Role::writer).value());
+    const auto mapping =
+        ring::RingMapping::open_untrusted(files.ring.get(), ring::Access::read_write).value();
+    const ring::SlotTable slots(*mapping);
+    for (Tid tid = 0; tid < 600; ++tid) {
+      ring::SlotHeader& slot = slots.slot(tid);
+      slot.run_start = tid;
+      slot.run_parent = slot.run_jump = tid - 1;
+    }
+    mapping->header().run_start = 599;
+    rig.open(peer, "runs");
+  }
+  static Duration processor_time(const std::function<void()>& work) {
+    const auto used = [] {
+      timespec time{};
+      ::clock_gettime(CLOCK_THREAD_CPUTIME_ID, &time);
+      return std::chrono::seconds(time.tv_sec) + std::chrono::nanoseconds(time.tv_nsec);
+    };
+    const auto before = used();
+    work();
+    return used() - before;
+  }
+};
+
+TEST_F(SearchWithoutEnd, TakesLittleOfATurn) {
+  constexpr std::int64_t kBeforeAll = 1;
+  const ring::RingReader reader(stream->mapping());
+  Tid tid = kNoTid;
+  const Duration all_retries = processor_time(
+      [&] { EXPECT_EQ(reader.find(time_from_ns(kBeforeAll), tid), ReadStatus::lapped); });
+  net::Frame range = with_serial(1);
+  range.mutable_get_range()->set_time_ns(kBeforeAll);
+  const Duration taken =
+      processor_time([&] { EXPECT_EQ(ask(range).at(0).range().at_tid(), kNoTid); });
+  EXPECT_LT(10 * taken, all_retries);
+}
+
+TEST_F(SearchWithoutEnd, GoesOnInLaterTurnsAndIsGivenUp) {
+  net::Frame frame = with_serial(2);
+  frame.mutable_read()->set_time_ns(1);
+  EXPECT_TRUE(ask(frame).empty()) << "after 8 turns";
+  rig.turns(200);
+  const std::vector<net::Frame> answers = peer.take();
+  ASSERT_EQ(answers.size(), 1U);
+  EXPECT_EQ(answers[0].no_sample().status(), static_cast<std::uint32_t>(ReadStatus::lapped));
 }
 
 // --- subscriptions
