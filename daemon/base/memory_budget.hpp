@@ -11,6 +11,7 @@
 #include <cstdint>
 #include <dssm/result.hpp>
 #include <map>
+#include <new>
 #include <optional>
 #include <string>
 #include <utility>
@@ -22,6 +23,17 @@ namespace dssm::daemon {
 // For a connection that ends because the system has no memory for what it asked.
 inline Error no_memory_left() {
   return {Errc::no_memory, "dssmd has no memory left for this connection; try again later"};
+}
+
+// Calls `then` with what `make` returns; with no_memory when either of them finds none: others wait
+// for their answers behind this one.
+template <class Then, class Make>
+void answer_with(const Then& then, Make make) {
+  try {
+    then(make());
+  } catch (const std::bad_alloc&) {
+    then(no_memory_left());
+  }
 }
 
 class MemoryBudget;

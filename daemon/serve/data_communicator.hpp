@@ -167,7 +167,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   void on_closed(const Error& why) override;
   void work_now() override;
   void work_soon() override;
-  void work_guarded();
+  void do_work();
 
   Result<void> greet(const net::Frame& frame);
   bool proves_host() const;

@@ -505,6 +505,32 @@ TEST_F(StreamChannelTest, BringsPublishedSamplesToOtherChannels) {
   EXPECT_EQ(words(reader.take()), "0");
 }
 
+TEST_F(StreamChannelTest, EndsAloneWhenASampleFindsNoMemory) {
+  start_publishing(11);
+  MemoryPeer without_memory, other;
+  for (MemoryPeer* reader : {&without_memory, &other}) {
+    rig.connect(*reader);
+    rig.open(*reader, "odometry");
+    net::Frame frame = with_serial(60);
+    frame.mutable_subscribe()->set_from_now(true);
+    reader->put(frame);
+    rig.turns();
+    EXPECT_EQ(words(reader->take()), "subscribed:0 caught_up");
+  }
+  bool has_thrown = false;
+  without_memory.after_send = [&] {
+    if (!std::exchange(has_thrown, true)) throw std::bad_alloc();
+  };
+  for (const Tid tid : {0, 1}) {
+    peer.put(sample_frame(tid));
+    rig.turns();
+    EXPECT_EQ(words(other.take()), std::to_string(tid));
+  }
+  EXPECT_TRUE(has_thrown);
+  EXPECT_TRUE(without_memory.closed);
+  EXPECT_FALSE(peer.closed) << "the publisher, whose sample it was";
+}
+
 TEST_F(StreamChannelTest, RefusesSamplesBeforeStartPublishing) {
   peer.put(sample_frame(0));
   rig.turns();
