@@ -144,10 +144,9 @@ void FrameConnection::continue_receiving() {
     return true;
   }
   close_with({Errc::limit_exceeded,
-              fmt::format("no memory is left to receive a frame of more than {} bytes: "
-                          "max_peer_memory = {} bytes are used up; use fewer connections or raise "
-                          "that key",
-                          bytes, budget_->limit())});
+              fmt::format("no memory is left to receive a frame of more than {} bytes: {} are "
+                          "used up; use fewer connections or raise that key",
+                          bytes, peer_memory(*budget_))});
   return false;
 }
 
@@ -219,10 +218,10 @@ void FrameConnection::send(const net::Frame& frame) {
     std::optional<MemoryShare> share = budget_->try_take(bytes);
     if (!share) {
       return refuse({Errc::limit_exceeded,
-                     fmt::format("the other side does not read: no memory is left for {} bytes "
-                                 "more of max_peer_memory = {} bytes; read faster, use fewer "
-                                 "connections, or raise that key",
-                                 bytes, budget_->limit())});
+                     fmt::format("the other side does not read, and no memory is left for {} "
+                                 "bytes more: {} are used up; read faster, use fewer connections, "
+                                 "or raise that key",
+                                 bytes, peer_memory(*budget_))});
     }
     outgoing.share = *std::move(share);
   }

@@ -112,10 +112,10 @@ Result<void> DataCommunicator::on_frame(net::Frame& frame) {
   std::optional<MemoryShare> share = place_.budget().try_take(parsed_bytes(frame));
   if (!share) {
     return Error{Errc::limit_exceeded,
-                 fmt::format("no memory is left to keep a request of {} bytes until its turn: "
-                             "max_peer_memory = {} bytes are used up; read the answers faster, use "
-                             "fewer connections, or raise that key",
-                             frame.ByteSizeLong(), place_.budget().limit())};
+                 fmt::format("no memory is left to keep a request of {} bytes until its turn: {} "
+                             "are used up; read the answers faster, use fewer connections, or "
+                             "raise that key",
+                             frame.ByteSizeLong(), peer_memory(place_.budget()))};
   }
   waiting_ = {std::move(frame), *std::move(share)};
   link_.pause();

@@ -90,6 +90,7 @@ Values values_of_the_code() {
       {"max_connections", count(config.max_connections)},
       {"max_connections_per_host", count(config.max_connections_per_host)},
       {"max_peer_memory", bytes(config.max_peer_memory_bytes)},
+      {"PeerTable::Limits::all_bytes()", count(PeerTable::kFullPeers) + " times max_peer_memory"},
       {"PConnectorOptions::max_unsent_samples", count(remote.max_unsent_samples)},
       {"PConnectorOptions::max_unsent_bytes", bytes(remote.max_unsent_bytes)},
       {"PConnectorOptions::request_timeout", time(remote.request_timeout)},
