@@ -74,6 +74,7 @@ DataCommunicator::DataCommunicator(const Parts& parts, PeerPlace place,
       peer_timeout_(EventSource::timer(parts.loop, [this] { check_peer_timeout(); })) {
   link_.set_budget(place_.budget());
   link_.take_requests_only();
+  link_.set_turn(turn_, parts.turns);
   link_.set_pace(place_.pace());
   link_.set_output_timeout(kOutputTimeout);
   greeting_timeout_.enable_in(wire::kHelloTimeout);

@@ -225,6 +225,12 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
   if (!pump_) return {};
   const MonoTime now = pump_->thins() ? parts_.loop.now() : parts_.loop.coarse_now();
   feed_->forget(*this);
+  const std::uint64_t samples_before = sender_.counters().samples;
+  const std::uint64_t bytes_before = sender_.payload_bytes();
+  const auto has_sent_little = [&] {
+    return sender_.payload_bytes() - bytes_before < SamplePump::kBytesPerTurn / 4 &&
+           sender_.counters().samples - samples_before < SamplePump::kSamplesPerTurn / 4;
+  };
   Result<PumpWait> wait = pump_->pump(now, request_waits);
   for (int checks = 0; wait && (*wait == PumpWait::sample || *wait == PumpWait::pace); ++checks) {
     if (feed_->wait(*this, pump_->known())) {
@@ -232,7 +238,7 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
       return {};
     }
     // One came between the check and the arming of the doorbell.
-    wait = checks < kMaxChecks ? pump_->pump(now) : Result(PumpWait::turn);
+    wait = checks < kMaxChecks && has_sent_little() ? pump_->pump(now) : Result(PumpWait::turn);
   }
   if (!wait)
     return std::move(wait).error().context("send samples of '" + stream().id().str() + "'");

@@ -169,6 +169,7 @@ Values values_of_the_code() {
       DSSM_BYTES(FrameConnection::kBytesPerTurn),
       DSSM_BYTES(wire::FrameDecoder::kCollectedPerReceive),
       DSSM_COUNT(FrameConnection::kReceivesPerTurn),
+      DSSM_COUNT(FrameConnection::kSamplesPerTurn),
       DSSM_BYTES(SamplePump::kBytesPerTurn),
       DSSM_COUNT(StreamChannel::kMaxFinds),
       DSSM_COUNT(SamplePump::kSamplesPerTurn),

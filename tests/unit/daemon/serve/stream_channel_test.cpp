@@ -10,6 +10,7 @@
 #include <new>
 #include <thread>
 
+#include "daemon/base/turn_queue.hpp"
 #include "tests/unit/daemon/remote/fake_clock_assessor.hpp"
 #include "tests/unit/daemon/serve/server_rig.hpp"
 
@@ -581,6 +582,74 @@ TEST_F(StreamChannelTest, HoldsNoMoreForAPublisherThanItsHostMay) {
   EXPECT_EQ(refused.failure().code(), "limit_exceeded");
   EXPECT_NE(refused.failure().message().find("max_peer_memory"), std::string::npos);
   EXPECT_NE(refused.failure().message().find("'camera:0@pc1'"), std::string::npos);
+}
+
+// --- turns
+
+// Four channels, and each frame that one of them is sent takes the time that all have in a turn.
+class SlowChannels : public StreamChannelTest {
+ protected:
+  void begin(const std::function<net::Frame(std::uint64_t number)>& request) {
+    for (std::uint64_t i = 0; i < std::size(peers); ++i) {
+      rig.connect(peers[i]);
+      rig.open(peers[i], "odometry");
+      peers[i].put(request(i));
+      rig.turns();
+      EXPECT_FALSE(peers[i].take().empty());
+      peers[i].after_send = [] {
+        for (const MonoTime begin = MonoClock::now();
+             MonoClock::now() - begin < TurnQueue::kMaxTurn;) {
+        }
+      };
+    }
+  }
+  // In one turn of the loop: one at once, and one of those that waited.
+  void expect_served_in_turns() {
+    const auto served = [this] {
+      return std::count_if(std::begin(peers), std::end(peers),
+                           [](const MemoryPeer& one) { return !one.sent.empty(); });
+    };
+    for (int turn = 0; turn < 20 && served() < 4; ++turn) {
+      const auto before = served();
+      rig.turns(1);
+      EXPECT_LE(served() - before, 2);
+    }
+    EXPECT_EQ(served(), 4);
+  }
+  MemoryPeer peers[4];
+};
+
+TEST_F(SlowChannels, AreSentSamplesInTurns) {
+  begin([](std::uint64_t) {
+    net::Frame frame = with_serial(60);
+    frame.mutable_subscribe()->set_from_now(true);
+    return frame;
+  });
+  rig.write(*stream);
+  expect_served_in_turns();
+}
+
+TEST_F(SlowChannels, HaveTheirSamplesTakenInTurns) {
+  begin([](std::uint64_t number) { return start_publishing_request(20 + number); });
+  for (MemoryPeer& one : peers) one.put(sample_frame(0));
+  expect_served_in_turns();
+  EXPECT_EQ(ring::RingReader(stream->mapping()).newest(), 3);
+}
+
+TEST_F(StreamChannelTest, TakesManySmallSamplesInSeveralTurns) {
+  start_publishing(11);
+  constexpr int kSamples = 20'000;
+  Bytes samples;
+  for (int i = 0; i < kSamples; ++i) {
+    const Bytes one = sample_frame(i);
+    samples.insert(samples.end(), one.begin(), one.end());
+  }
+  peer.max_receive_bytes = 16U << 10;
+  peer.put(samples);
+  rig.turns(1);
+  const ring::RingReader reader(stream->mapping());
+  EXPECT_LT(reader.newest(), 2 * Tid{FrameConnection::kSamplesPerTurn});
+  run_until(rig.loop, [&] { return reader.newest() == kSamples - 1; });
 }
 
 // --- property
