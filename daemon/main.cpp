@@ -86,7 +86,8 @@ OpenTable::Limits open_limits(const Config& config) {
   return {config.max_opens, config.max_opens_per_client, {config.max_share_percent}};
 }
 PeerTable::Limits peer_limits(const Config& config) {
-  return {config.max_connections, config.max_connections_per_host, config.max_peer_memory_bytes};
+  return {config.max_connections, config.max_connections_per_host, config.max_peer_memory_bytes,
+          memory_of_the_machine()};
 }
 
 // The line in `systemctl status`.

@@ -109,8 +109,8 @@ ReadStatus RingReader::stamp(Tid tid, SampleInfo& info) const noexcept {
   return locate(tid, place, info);
 }
 
-[[gnu::flatten]] ReadStatus RingReader::find(Time t, Tid& tid) const noexcept {
-  for (int attempt = 0; attempt < kMaxRetries; ++attempt) {
+[[gnu::flatten]] ReadStatus RingReader::find(Time t, Tid& tid, int attempts) const noexcept {
+  for (int attempt = 0; attempt < attempts; ++attempt) {
     const Tid top = newest();
     if (top < 0) return ReadStatus::not_yet;
     // That of `top` was stored before `top`, and later ones are greater, or belong to the same run

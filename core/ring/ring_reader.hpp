@@ -65,8 +65,9 @@ class RingReader {
   }
 
   // Tid of the newest sample with time <= `t`; kNoTid with too_old when all lie after it.
+  //   attempts  how often it is looked for, while the writer overtakes the search
   //   returns  ok | not_yet (empty) | arriving (it may be in the hole or before) | too_old | lapped
-  ReadStatus find(Time t, Tid& tid) const noexcept;
+  ReadStatus find(Time t, Tid& tid, int attempts = kMaxRetries) const noexcept;
 
   // The payload of sample `tid` in place, info.payload_bytes long. It was that sample's if
   // `sequence` still holds `expected` after the last access: see still_valid().

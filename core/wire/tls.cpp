@@ -16,11 +16,11 @@
 #include <cerrno>
 #include <cstring>
 #include <memory>
+#include <new>
 #include <optional>
 #include <utility>
 #include <vector>
 
-#include "core/base/check.hpp"
 #include "core/base/try.hpp"
 
 namespace dssm::wire {
@@ -57,9 +57,12 @@ class TlsTransport final : public Transport {
         lower_(std::move(lower)),
         ticket_(ticket),
         session_(SSL_new(credentials_->context_)) {
-    DSSM_CHECK(session_);
+    if (!session_) throw std::bad_alloc();
     BIO* bio = BIO_new(method());
-    DSSM_CHECK(bio);
+    if (!bio) {
+      SSL_free(session_);
+      throw std::bad_alloc();
+    }
     BIO_set_data(bio, this);
     BIO_set_init(bio, 1);
     SSL_set_bio(session_, bio, bio);
@@ -356,10 +359,16 @@ class TlsTransport final : public Transport {
   }
 
   static int on_write(BIO* bio, const char* bytes, std::size_t count, std::size_t* written) {
-    std::vector<std::byte>& output = static_cast<TlsTransport*>(BIO_get_data(bio))->output_;
+    auto& self = *static_cast<TlsTransport*>(BIO_get_data(bio));
+    std::vector<std::byte>& output = self.output_;
     if (output.empty()) output.swap(spare_output());
     const auto* from = reinterpret_cast<const std::byte*>(bytes);
-    output.insert(output.end(), from, from + count);
+    try {
+      output.insert(output.end(), from, from + count);
+    } catch (const std::bad_alloc&) {  // which must not go through OpenSSL
+      self.lower_error_ = Error{Errc::no_memory, "no memory is left to encrypt"};
+      return 0;
+    }
     *written = count;
     return 1;
   }

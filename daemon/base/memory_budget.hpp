@@ -11,6 +11,7 @@
 #include <cstdint>
 #include <dssm/result.hpp>
 #include <map>
+#include <new>
 #include <optional>
 #include <string>
 #include <utility>
@@ -22,6 +23,17 @@ namespace dssm::daemon {
 // For a connection that ends because the system has no memory for what it asked.
 inline Error no_memory_left() {
   return {Errc::no_memory, "dssmd has no memory left for this connection; try again later"};
+}
+
+// Calls `then` with what `make` returns; with no_memory when either of them finds none: others wait
+// for their answers behind this one.
+template <class Then, class Make>
+void answer_with(const Then& then, Make make) {
+  try {
+    then(make());
+  } catch (const std::bad_alloc&) {
+    then(no_memory_left());
+  }
 }
 
 class MemoryBudget;
@@ -90,6 +102,9 @@ class MemoryBudget {
   std::uint64_t used() const noexcept { return used_; }
   std::uint64_t limit() const noexcept { return limit_; }
 
+  // Of all accounts together; 0: there is no such limit.
+  std::uint64_t limit_of_all() const noexcept { return all_ ? all_->limit() : 0; }
+
   // Nothing is taken back: below what is used, nothing more is given.
   void set_limit(std::uint64_t limit_bytes) noexcept { limit_ = limit_bytes; }
 
@@ -104,6 +119,15 @@ class MemoryBudget {
   MemoryBudget* const all_ = nullptr;
   const std::string account_;
 };
+
+// What a peer's memory may be, for errors.
+inline std::string peer_memory(const MemoryBudget& budget) {
+  std::string text = fmt::format("max_peer_memory = {} bytes", budget.limit());
+  if (const std::uint64_t all = budget.limit_of_all()) {
+    text += fmt::format(", or the {} that all peers may use together,", all);
+  }
+  return text;
+}
 
 inline void MemoryShare::give_back() noexcept {
   const std::uint64_t bytes = std::exchange(bytes_, 0);

@@ -12,9 +12,9 @@ TurnQueue::Turn::Turn(TurnQueue& queue, std::string account, std::function<void(
       events_(std::move(account), Reason::event),
       take_(std::move(take)) {}
 
-bool TurnQueue::Turn::may_begin() {
+bool TurnQueue::Turn::may_begin(Reason reason) {
   if (is_called_ || (queue_.waiting_.empty() && queue_.used_ < kMaxTurn)) return true;
-  wait();
+  wait(reason);
   return false;
 }
 

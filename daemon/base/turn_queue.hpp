@@ -45,7 +45,7 @@ class TurnQueue {
     ~Turn() { stop(); }
 
     // Whether the client may work now. If not, it waits.
-    bool may_begin();
+    bool may_begin(Reason reason = Reason::request);
     // A client that waits for events may begin to wait with a request, not the other way round.
     void wait(Reason reason = Reason::request);
     bool is_waiting() const noexcept { return is_waiting_; }
@@ -63,16 +63,17 @@ class TurnQueue {
     Waiting::iterator place_{};
   };
 
-  // Measures a piece of work from its construction to its end.
+  // Measures a piece of work from its construction to its end. One within another one counts once.
   class Work {
    public:
-    explicit Work(TurnQueue& queue) : queue_(queue) {}
+    explicit Work(TurnQueue& queue) : queue_(queue), before_(queue.used_) {}
     Work(const Work&) = delete;
     Work& operator=(const Work&) = delete;
-    ~Work() { queue_.used_ += MonoClock::now() - begin_; }
+    ~Work() { queue_.used_ = before_ + (MonoClock::now() - begin_); }
 
    private:
     TurnQueue& queue_;
+    const Duration before_;
     const MonoTime begin_ = MonoClock::now();
   };
 

@@ -6,6 +6,8 @@
 #include <algorithm>
 #include <utility>
 
+#include "daemon/base/memory_budget.hpp"
+
 namespace dssm::daemon {
 namespace {
 
@@ -120,9 +122,11 @@ void PeerConnection::on_down(const Error& error) {
   // First, so that those who wait find the host down, and can answer from what is known here.
   observer_.on_peer_down(*this, error, attempt);
   for (const auto& [serial, waiting] : unanswered) {
-    waiting.then(Error{Errc::unavailable,
-                       fmt::format("the connection to host '{}' ended before it answered: {}",
-                                   them_ ? them_->host : configured_.str(), error.message)});
+    answer_with(waiting.then, [&]() -> Result<net::Frame> {
+      return Error{Errc::unavailable,
+                   fmt::format("the connection to host '{}' ended before it answered: {}",
+                               them_ ? them_->host : configured_.str(), error.message)};
+    });
   }
 }
 

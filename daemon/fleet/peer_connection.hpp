@@ -69,7 +69,8 @@ class PeerConnection final : private Dialer::Observer {
 
   // Sends a request (its serial is set here). `then` gets the answer or an error: the
   // peer's own, limit_exceeded (too much is waiting), unavailable (not up, or the connection
-  // broke). Called once, from the loop, or at once when nothing was sent.
+  // broke). Called once, from the loop, or at once when nothing was sent. When it throws bad_alloc
+  // at the end of the connection, it is called once more, with no_memory.
   using Then = std::function<void(Result<net::Frame>)>;
   void ask(net::Frame request, Then then);
 

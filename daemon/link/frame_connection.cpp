@@ -78,10 +78,30 @@ void FrameConnection::take_samples(std::size_t payload_bytes, SampleDelegate& de
 // --- receiving
 
 [[gnu::hot]] void FrameConnection::on_readable() {
+  if (!turn_ || !samples_) return receive();
+  if (!turn_->may_begin(TurnQueue::Reason::event)) {
+    awaits_turn_ = true;
+    return readable_.disable();
+  }
+  const TurnQueue::Work work(*turns_);
+  receive();
+}
+
+// At once: all that wait get their turn before the loop looks at the sockets again.
+void FrameConnection::take_turn() {
+  if (closed_ || !std::exchange(awaits_turn_, false) || input_.paused) return;
+  readable_.enable();
+  on_readable();
+}
+
+[[gnu::hot]] void FrameConnection::receive() {
   std::size_t received = 0;
+  const std::uint64_t samples_before = decoder_.counters().samples;
   Error end;
   bool ended = false;
-  for (int receives = 0; receives < kReceivesPerTurn && received < kBytesPerTurn; ++receives) {
+  for (int receives = 0; receives < kReceivesPerTurn && received < kBytesPerTurn &&
+                         decoder_.counters().samples - samples_before < kSamplesPerTurn;
+       ++receives) {
     const std::span<const iovec> spaces = decoder_.spaces();
     const std::size_t free_bytes = total(spaces);
     const Result<wire::IoResult> got = transport_->receive(spaces);
@@ -144,10 +164,9 @@ void FrameConnection::continue_receiving() {
     return true;
   }
   close_with({Errc::limit_exceeded,
-              fmt::format("no memory is left to receive a frame of more than {} bytes: "
-                          "max_peer_memory = {} bytes are used up; use fewer connections or raise "
-                          "that key",
-                          bytes, budget_->limit())});
+              fmt::format("no memory is left to receive a frame of more than {} bytes: {} are "
+                          "used up; use fewer connections or raise that key",
+                          bytes, peer_memory(*budget_))});
   return false;
 }
 
@@ -219,10 +238,10 @@ void FrameConnection::send(const net::Frame& frame) {
     std::optional<MemoryShare> share = budget_->try_take(bytes);
     if (!share) {
       return refuse({Errc::limit_exceeded,
-                     fmt::format("the other side does not read: no memory is left for {} bytes "
-                                 "more of max_peer_memory = {} bytes; read faster, use fewer "
-                                 "connections, or raise that key",
-                                 bytes, budget_->limit())});
+                     fmt::format("the other side does not read, and no memory is left for {} "
+                                 "bytes more: {} are used up; read faster, use fewer connections, "
+                                 "or raise that key",
+                                 bytes, peer_memory(*budget_))});
     }
     outgoing.share = *std::move(share);
   }

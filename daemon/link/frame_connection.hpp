@@ -25,6 +25,7 @@
 #include "core/wire/transport.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/memory_budget.hpp"
+#include "daemon/base/turn_queue.hpp"
 #include "daemon/link/history_pace.hpp"
 
 namespace dssm::daemon {
@@ -59,6 +60,7 @@ class FrameConnection final : private wire::FrameDelegate {
   // Received in one turn, before other connections get theirs.
   static constexpr int kReceivesPerTurn = 16;
   static constexpr std::size_t kBytesPerTurn = 1U << 20;
+  static constexpr std::uint64_t kSamplesPerTurn = 1024;
 
   // An error returned from a handler closes the connection with a final failure. Handlers may send
   // on the connection, pause it and close it, but not destroy it.
@@ -100,6 +102,15 @@ class FrameConnection final : private wire::FrameDelegate {
   // From now on samples of this size are received and go to `delegate`, which outlives the
   // connection. Before, a sample is an error of the peer.
   void take_samples(std::size_t payload_bytes, SampleDelegate& delegate) noexcept;
+
+  // From now on samples are received only in this client's turns, of which each calls take_turn().
+  // Both outlive the connection's use of them.
+  void set_turn(TurnQueue::Turn& turn, TurnQueue& turns) noexcept {
+    turn_ = &turn;
+    turns_ = &turns;
+  }
+  // Receives, if there was something to receive and it was not this client's turn.
+  void take_turn();
 
   // Frames that wait to be sent, and a long frame that is being received, are charged to `budget`,
   // which outlives the connection; when it is used up, the connection closes itself.
@@ -231,6 +242,7 @@ class FrameConnection final : private wire::FrameDelegate {
   template <class Work>
   void guarded(Work work);
   void on_readable();
+  void receive();
   void on_writable();
   void continue_receiving();
   void continue_soon();
@@ -260,6 +272,9 @@ class FrameConnection final : private wire::FrameDelegate {
   HistoryShare share_;
   Duration output_timeout_{};
   std::uint64_t sent_bytes_ = 0;
+  TurnQueue::Turn* turn_ = nullptr;
+  TurnQueue* turns_ = nullptr;
+  bool awaits_turn_ = false;  // to receive
   bool limits_unsent_ = false;
   std::optional<wire::Progress> when_writable_;
   wire::FrameDecoder decoder_;

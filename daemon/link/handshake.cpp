@@ -6,12 +6,14 @@
 
 #include <algorithm>
 #include <cerrno>
+#include <new>
 #include <utility>
 
 #include "core/wire/frame.hpp"
 #include "core/wire/messages.hpp"
 #include "core/wire/network_protocol.hpp"
 #include "core/wire/tcp.hpp"
+#include "daemon/base/memory_budget.hpp"
 
 namespace dssm::daemon {
 
@@ -46,8 +48,12 @@ Handshake::Handshake(const EventLoop& loop, std::shared_ptr<const wire::TlsCrede
 }
 
 void Handshake::on_ready() {
-  if (!tls_ && budget_) return recognize();
-  go_on();
+  try {
+    if (!tls_ && budget_) return recognize();
+    go_on();
+  } catch (const std::bad_alloc&) {
+    finish(no_memory_left());
+  }
 }
 
 void Handshake::recognize() {

@@ -42,8 +42,9 @@ class HandshakeBudget {
 
 class Handshake {
  public:
-  // Called once, from the loop; must not destroy the handshake. Null: the other side closed an
-  // accepted connection before its first byte.
+  // Called once, from the loop, and when it throws bad_alloc once more, with no_memory; must not
+  // destroy the handshake. Null: the other side closed an accepted connection before its first
+  // byte.
   using Then = std::function<void(Result<std::unique_ptr<wire::Transport>>)>;
 
   // Both start at once; loop outlives them.

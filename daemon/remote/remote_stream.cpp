@@ -8,6 +8,7 @@
 #include <utility>
 
 #include "core/base/try.hpp"
+#include "daemon/base/memory_budget.hpp"
 
 namespace dssm::daemon {
 
@@ -209,9 +210,11 @@ void RemoteStream::set_pending_deadline(MonoTime deadline) {
 void RemoteStream::answer_pending(bool created) {
   if (pending_.empty()) return;
   for (const PendingOpen& one : std::exchange(pending_, {})) {
-    Result<OpenedRing> ring = opened(one.plan ? &*one.plan : nullptr);
-    if (ring) ring->created = std::exchange(created, false);
-    one.then(std::move(ring));
+    answer_with(one.then, [&] {
+      Result<OpenedRing> ring = opened(one.plan ? &*one.plan : nullptr);
+      if (ring) ring->created = std::exchange(created, false);
+      return ring;
+    });
   }
   after_pending();
 }
@@ -229,20 +232,24 @@ void RemoteStream::answer_ready() {
   const std::vector<PendingOpen> ready =
       take_pending([this](const PendingOpen& one) { return can_open_now(one.waits_for_history); });
   if (ready.empty()) return;
-  for (const PendingOpen& one : ready) one.then(opened(one.plan ? &*one.plan : nullptr));
+  for (const PendingOpen& one : ready) {
+    answer_with(one.then, [&] { return opened(one.plan ? &*one.plan : nullptr); });
+  }
   after_pending();
 }
 
 void RemoteStream::fail_pending(const Error& why) {
   if (pending_.empty()) return;
-  for (const PendingOpen& one : std::exchange(pending_, {})) one.then(why);
+  for (const PendingOpen& one : std::exchange(pending_, {})) {
+    answer_with(one.then, [&]() -> Result<OpenedRing> { return why; });
+  }
   after_pending();
 }
 
 void RemoteStream::fail_first_pending(const Error& why) {
   const PendingOpen first = std::move(pending_.front());
   pending_.erase(pending_.begin());
-  first.then(why);
+  answer_with(first.then, [&]() -> Result<OpenedRing> { return why; });
   after_pending();
 }
 
@@ -271,15 +278,14 @@ void RemoteStream::on_pending_timer() {
   const std::vector<PendingOpen> overdue =
       take_pending([now](const PendingOpen& one) { return one.deadline <= now; });
   for (const PendingOpen& one : overdue) {
-    if (stream() && !is_removed_) {
-      one.then(opened(one.plan ? &*one.plan : nullptr));
-    } else {
-      one.then(Error{Errc::unavailable,
-                     fmt::format("stream '{}': host '{}' does not answer at '{}'{}; see `dssmctl "
-                                 "hosts`, and retry",
-                                 name_, id_.host, connection_.address().str(),
-                                 last_error_ ? ": " + last_error_->message : "")});
-    }
+    answer_with(one.then, [&]() -> Result<OpenedRing> {
+      if (stream() && !is_removed_) return opened(one.plan ? &*one.plan : nullptr);
+      return Error{Errc::unavailable,
+                   fmt::format("stream '{}': host '{}' does not answer at '{}'{}; see `dssmctl "
+                               "hosts`, and retry",
+                               name_, id_.host, connection_.address().str(),
+                               last_error_ ? ": " + last_error_->message : "")};
+    });
   }
   after_pending();
 }

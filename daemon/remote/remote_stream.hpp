@@ -165,7 +165,8 @@ class RemoteStream : private Dialer::Observer, protected channel::ChannelClient:
   static constexpr Duration kOwnerTimeout = std::chrono::seconds(2);
   static constexpr Duration kGapLinePeriod = std::chrono::seconds(10);
 
-  // Called once, from the loop, or at once from within open(); not after this is destroyed.
+  // Called once, from the loop, or at once from within open(); not after this is destroyed. When it
+  // throws bad_alloc from the loop, it is called once more, with no_memory.
   using Then = std::function<void(Result<OpenedRing>)>;
 
   RemoteStream(const RemoteStream&) = delete;

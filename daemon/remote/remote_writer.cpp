@@ -6,6 +6,7 @@
 
 #include <fmt/format.h>
 
+#include <new>
 #include <utility>
 
 #include "core/base/try.hpp"
@@ -126,8 +127,17 @@ void RemoteWriter::start_publishing() {
   turn_timer_.enable_in(Duration::zero());
 }
 
+// Also called by a feed, which must get no exception.
 void RemoteWriter::publish() {
   if (!pump_) return;
+  try {
+    pump();
+  } catch (const std::bad_alloc&) {
+    connection_.frames()->close_with(no_memory_left());
+  }
+}
+
+void RemoteWriter::pump() {
   const Result<PumpWait> wait = pump_->pump({});
   if (!wait) return connection_.frames()->close_with(wait.error());
   if (*wait == PumpWait::turn ||

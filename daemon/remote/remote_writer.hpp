@@ -68,6 +68,7 @@ class RemoteWriter final : public RemoteStream,
   Result<void> use_ring(std::unique_ptr<OutgoingRing> ring);
   void start_publishing();
   void publish();
+  void pump();
   void stop_publishing() noexcept;
   void on_drain_timer();
 

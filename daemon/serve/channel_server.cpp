@@ -173,7 +173,7 @@ Result<void> ChannelServer::keep(std::unique_ptr<wire::Transport>& transport,
   const std::string peer = account_of(address.str(), certified);
   const bool is_configured = parts_.is_configured && parts_.is_configured(address, certified);
   const bool is_crowd = peers_.is_full_for(peer, certified);
-  if (is_crowd || (peers_.is_full() && !is_configured)) {
+  if (is_crowd || (peers_.is_full(certified) && !is_configured)) {
     give_up_one([&](const Arrival& one) {
       return one.communicator && (is_crowd ? one.peer == peer : !one.is_configured);
     });

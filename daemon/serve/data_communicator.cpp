@@ -63,8 +63,8 @@ DataCommunicator::DataCommunicator(const Parts& parts, PeerPlace place,
       peer_address_(std::move(peer_address)),
       link_(parts.loop, std::move(transport), *this, kMaxQueuedBytes),
       catalog_(parts.registry, parts.opens, kMaxListBytes),
-      turn_(parts.turns, account_of(peer_address_, link_.peer()), [this] { work_guarded(); }),
-      next_turn_(EventSource::timer(parts.loop, [this] { work_guarded(); })),
+      turn_(parts.turns, account_of(peer_address_, link_.peer()), [this] { work_now(); }),
+      next_turn_(EventSource::timer(parts.loop, [this] { work_now(); })),
       greeting_timeout_(EventSource::timer(
           parts.loop,
           [this] {
@@ -74,6 +74,7 @@ DataCommunicator::DataCommunicator(const Parts& parts, PeerPlace place,
       peer_timeout_(EventSource::timer(parts.loop, [this] { check_peer_timeout(); })) {
   link_.set_budget(place_.budget());
   link_.take_requests_only();
+  link_.set_turn(turn_, parts.turns);
   link_.set_pace(place_.pace());
   link_.set_output_timeout(kOutputTimeout);
   greeting_timeout_.enable_in(wire::kHelloTimeout);
@@ -112,10 +113,10 @@ Result<void> DataCommunicator::on_frame(net::Frame& frame) {
   std::optional<MemoryShare> share = place_.budget().try_take(parsed_bytes(frame));
   if (!share) {
     return Error{Errc::limit_exceeded,
-                 fmt::format("no memory is left to keep a request of {} bytes until its turn: "
-                             "max_peer_memory = {} bytes are used up; read the answers faster, use "
-                             "fewer connections, or raise that key",
-                             frame.ByteSizeLong(), place_.budget().limit())};
+                 fmt::format("no memory is left to keep a request of {} bytes until its turn: {} "
+                             "are used up; read the answers faster, use fewer connections, or "
+                             "raise that key",
+                             frame.ByteSizeLong(), peer_memory(place_.budget()))};
   }
   waiting_ = {std::move(frame), *std::move(share)};
   link_.pause();
@@ -393,15 +394,17 @@ void DataCommunicator::work_soon() {
 
 void DataCommunicator::on_output_empty() { work_now(); }
 
-void DataCommunicator::work_guarded() {
+// An exception that leaves a callback would end dssmd; one that goes through a feed's or another
+// connection's work, that connection.
+[[gnu::hot]] void DataCommunicator::work_now() {
   try {
-    work_now();
+    do_work();
   } catch (const std::bad_alloc&) {
     link_.close_with(no_memory_left());
   }
 }
 
-[[gnu::hot]] void DataCommunicator::work_now() {
+[[gnu::hot]] void DataCommunicator::do_work() {
   if (!link_.is_open()) return;
   if (std::exchange(turn_is_due_, false)) next_turn_.disable();
   served_ = 0;
@@ -415,7 +418,10 @@ void DataCommunicator::work_guarded() {
     serve(waiting.request);
     link_.resume();
   }
-  if (channel_) {
+  if (channel_ && turn_.may_begin(TurnQueue::Reason::event)) {
+    const TurnQueue::Work work(parts_.turns);
+    link_.take_turn();
+    if (!link_.is_open()) return;
     const Result<void> worked = channel_->work(waiting_.has_value());
     if (!worked) return link_.close_with(worked.error());
   }

@@ -167,7 +167,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   void on_closed(const Error& why) override;
   void work_now() override;
   void work_soon() override;
-  void work_guarded();
+  void do_work();
 
   Result<void> greet(const net::Frame& frame);
   bool proves_host() const;
@@ -209,7 +209,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   std::optional<Opening> opening_;
   std::unique_ptr<StreamChannel> channel_;
   std::set<Action> allowed_;  // on the channel
-  TurnQueue::Turn turn_;      // to serve what waits
+  TurnQueue::Turn turn_;      // to serve what waits, and for samples
   bool turn_is_due_ = false;  // to go on with what is in progress
   EventSource next_turn_, greeting_timeout_, idle_timeout_, peer_timeout_;
 };

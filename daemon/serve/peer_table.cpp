@@ -28,6 +28,7 @@ PeerPlace::~PeerPlace() {
 
 void PeerTable::set_limits(const Limits& limits) {
   limits_ = limits;
+  all_.set_limit(limits.all_bytes());
   for (const auto& [peer, account] : accounts_) {
     account->budget.set_limit(limits.max_peer_memory_bytes);
   }
@@ -43,6 +44,7 @@ void PeerTable::add_limits(LimitUses& out) const {
   out.push_back(
       {"max_connections_per_host", connections, limits_.max_connections_per_host, "connections"});
   out.push_back({"max_peer_memory", bytes, limits_.max_peer_memory_bytes, "bytes"});
+  out.push_back({"memory of all peers", all_.used(), all_.limit(), "bytes"});
 }
 
 bool PeerTable::is_full_for(const std::string& peer, bool encrypted) const {
@@ -54,7 +56,7 @@ bool PeerTable::is_full_for(const std::string& peer, bool encrypted) const {
 }
 
 Result<PeerPlace> PeerTable::admit(const std::string& peer, bool encrypted, bool is_configured) {
-  if (!is_configured && is_full()) {
+  if (!is_configured && connections_ >= limits_.max_connections) {
     return Error{Errc::limit_exceeded,
                  fmt::format("there are max_connections = {} connections from other hosts already; "
                              "close some or raise the key max_connections",
@@ -68,13 +70,16 @@ Result<PeerPlace> PeerTable::admit(const std::string& peer, bool encrypted, bool
                              limits_.max_connections_per_host, peer)};
   }
   std::unique_ptr<PeerAccount>& account = accounts_[peer];
-  if (!account) account = std::make_unique<PeerAccount>(peer, limits_.max_peer_memory_bytes);
+  if (!account) {
+    account = std::make_unique<PeerAccount>(peer, limits_.max_peer_memory_bytes,
+                                            is_configured ? nullptr : &all_);
+  }
   std::optional<MemoryShare> share = account->budget.try_take(bytes_of(encrypted));
   if (share) return PeerPlace(*this, *account, *std::move(share), is_configured);
   Error error{Errc::limit_exceeded,
-              fmt::format("the connections from {} have used up max_peer_memory = {} bytes; "
-                          "close some or raise the key max_peer_memory",
-                          peer, limits_.max_peer_memory_bytes)};
+              fmt::format("no memory is left for a connection from {}: {} are used up; close some "
+                          "or raise the key max_peer_memory",
+                          peer, peer_memory(account->budget))};
   if (account->connections == 0) accounts_.erase(peer);
   return error;
 }

@@ -2,10 +2,12 @@
 //
 // The connections over the network, by peer, and the memory that they use. Everything that a peer
 // can make grow (frames that wait for it, samples that are received from it, ...) is charged to its
-// account, so that one peer cannot use up the memory of the others. An address counts as a peer
-// unless a certificate says who is there.
+// account, so that one peer cannot use up the memory of the others; and that of all peers but the
+// configured ones to one budget, so that many addresses cannot use up the PC's. An address counts
+// as a peer unless a certificate says who is there.
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 #include <dssm/result.hpp>
 #include <map>
@@ -20,8 +22,10 @@ namespace dssm::daemon {
 
 // One peer, while there are connections of it.
 struct PeerAccount {
-  PeerAccount(std::string its_name, std::uint64_t memory_bytes)
-      : name(std::move(its_name)), budget(memory_bytes) {}
+  // all: of which its memory is taken, too; nullptr: none
+  PeerAccount(const std::string& its_name, std::uint64_t memory_bytes, MemoryBudget* all)
+      : name(its_name),
+        budget(all ? MemoryBudget(memory_bytes, *all, its_name) : MemoryBudget(memory_bytes)) {}
   std::string name;  // "10.0.0.2", "host 'pc2'"
   MemoryBudget budget;
   HistoryPace pace;
@@ -61,9 +65,17 @@ class PeerTable {
     std::uint64_t max_connections = 0;
     std::uint64_t max_connections_per_host = 0;
     std::uint64_t max_peer_memory_bytes = 0;
-  };
+    std::uint64_t machine_bytes = 0;  // of the PC's memory
 
-  explicit PeerTable(const Limits& limits) : limits_(limits) {}
+    // For all peers together: an eighth of the PC's memory, but enough for kFullPeers.
+    std::uint64_t all_bytes() const noexcept {
+      return std::max(kFullPeers * max_peer_memory_bytes, machine_bytes / 8);
+    }
+  };
+  // So many can use all of max_peer_memory at the same time.
+  static constexpr std::uint64_t kFullPeers = 4;
+
+  explicit PeerTable(const Limits& limits) : limits_(limits), all_(limits.all_bytes()) {}
   PeerTable(const PeerTable&) = delete;
   PeerTable& operator=(const PeerTable&) = delete;
 
@@ -73,13 +85,17 @@ class PeerTable {
   void add_limits(LimitUses& out) const;
 
   // Whether admit() would fail: for all but configured peers, and for this peer in any case.
-  bool is_full() const noexcept { return connections_ >= limits_.max_connections; }
+  bool is_full(bool encrypted = false) const noexcept {
+    return connections_ >= limits_.max_connections ||
+           all_.used() + bytes_of(encrypted) > all_.limit();
+  }
   bool is_full_for(const std::string& peer, bool encrypted) const;
 
   // A place for one more connection of `peer`: its address without a port or, when its certificate
   // says who it is, that.
   //   is_configured  the host is in the configuration (key peers): it does not count for
-  //                  max_connections, so that others cannot keep it out
+  //                  max_connections and in the memory of all peers, so that others cannot keep
+  //                  it out
   //   fails  limit_exceeded, naming the key
   Result<PeerPlace> admit(const std::string& peer, bool encrypted = false,
                           bool is_configured = false);
@@ -92,6 +108,7 @@ class PeerTable {
   }
   Limits limits_;
   std::uint64_t connections_ = 0;  // without those of configured peers
+  MemoryBudget all_;               // likewise
   std::map<std::string, std::unique_ptr<PeerAccount>> accounts_;
 };
 

@@ -20,10 +20,9 @@ Result<std::unique_ptr<SampleReceiver>> SampleReceiver::open(const EventLoop& lo
   std::optional<MemoryShare> share = budget.try_take(payload_bytes);
   if (!share) {
     return Error{Errc::limit_exceeded,
-                 fmt::format("publish into '{}': a sample of {} bytes does not fit into what is "
-                             "left of max_peer_memory = {} bytes for this address; close other "
-                             "connections or raise that key",
-                             stream.stream().id().str(), payload_bytes, budget.limit())};
+                 fmt::format("publish into '{}': no memory is left for a sample of {} bytes: {} "
+                             "are used up; close other connections or raise that key",
+                             stream.stream().id().str(), payload_bytes, peer_memory(budget))};
   }
   std::shared_ptr<OwnWriter> writer = DSSM_TRY(stream.writer());
   return std::unique_ptr<SampleReceiver>(

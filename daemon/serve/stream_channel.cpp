@@ -206,8 +206,9 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
     case net::Subscribe::kFromTimeNs: {
       Tid tid = kNoTid;
       const Time time = time_from_ns(request.from_time_ns());
-      return reader_.find(time, tid) == ReadStatus::ok ? std::clamp<Tid>(tid, oldest, next)
-                                                       : oldest;
+      return reader_.find(time, tid, kMaxFinds) == ReadStatus::ok
+                 ? std::clamp<Tid>(tid, oldest, next)
+                 : oldest;
     }
     case net::Subscribe::kFromOldest:
       return oldest;
@@ -224,6 +225,12 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
   if (!pump_) return {};
   const MonoTime now = pump_->thins() ? parts_.loop.now() : parts_.loop.coarse_now();
   feed_->forget(*this);
+  const std::uint64_t samples_before = sender_.counters().samples;
+  const std::uint64_t bytes_before = sender_.payload_bytes();
+  const auto has_sent_little = [&] {
+    return sender_.payload_bytes() - bytes_before < SamplePump::kBytesPerTurn / 4 &&
+           sender_.counters().samples - samples_before < SamplePump::kSamplesPerTurn / 4;
+  };
   Result<PumpWait> wait = pump_->pump(now, request_waits);
   for (int checks = 0; wait && (*wait == PumpWait::sample || *wait == PumpWait::pace); ++checks) {
     if (feed_->wait(*this, pump_->known())) {
@@ -231,7 +238,7 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
       return {};
     }
     // One came between the check and the arming of the doorbell.
-    wait = checks < kMaxChecks ? pump_->pump(now) : Result(PumpWait::turn);
+    wait = checks < kMaxChecks && has_sent_little() ? pump_->pump(now) : Result(PumpWait::turn);
   }
   if (!wait)
     return std::move(wait).error().context("send samples of '" + stream().id().str() + "'");
@@ -320,7 +327,7 @@ ReadStatus StreamChannel::find(const net::Read& request, Tid& tid) const {
       if (tid > newest) return ReadStatus::not_yet;
       return tid < 0 || tid < reader_.oldest() ? ReadStatus::too_old : ReadStatus::ok;
     case net::Read::kTimeNs: {
-      const ReadStatus found = reader_.find(time_from_ns(request.time_ns()), tid);
+      const ReadStatus found = reader_.find(time_from_ns(request.time_ns()), tid, kMaxFinds);
       // An owner's ring has no hole, unless a program wrote one into it.
       return found == ReadStatus::arriving ? ReadStatus::too_old : found;
     }
@@ -365,6 +372,7 @@ SendStatus StreamChannel::begin_reading() {
   if (!parts_.link.output_empty()) return SendStatus::blocked;
   Tid tid = kNoTid;
   const ReadStatus found = find(reading_->request, tid);
+  if (found == ReadStatus::lapped) return SendStatus::not_in_ring;
   if (found != ReadStatus::ok) {
     answer_no_sample(found);
     return SendStatus::sent;
@@ -400,7 +408,7 @@ Result<void> StreamChannel::get_range(std::uint64_t serial, const net::GetRange&
   range.set_at_tid(kNoTid);
   Tid tid = kNoTid;
   if (request.has_time_ns() &&
-      reader_.find(time_from_ns(request.time_ns()), tid) == ReadStatus::ok) {
+      reader_.find(time_from_ns(request.time_ns()), tid, kMaxFinds) == ReadStatus::ok) {
     range.set_at_tid(tid);
   }
   parts_.link.send(frame);

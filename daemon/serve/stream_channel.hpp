@@ -26,6 +26,10 @@ class StreamChannel final : private SamplePump::Observer,
                             private StreamFeed::Observer,
                             private FrameConnection::SampleDelegate {
  public:
+  // How often a sample is looked for by its time in one turn. A writer can link the runs in its
+  // ring so that each search ends without a result, after ring::kMaxHops.
+  static constexpr int kMaxFinds = 8;
+
   // Calls work(): at once, or in the next turn of the loop.
   class Observer {
    public:

@@ -112,6 +112,15 @@ class Hostile {
       fd_.reset();
     }
   }
+  // As much as the other side takes at once; erases it.
+  void send_part(std::string& bytes) {
+    if (!fd_) connect();
+    if (!fd_) return;
+    const ssize_t sent = ::send(fd_.get(), bytes.data(), bytes.size(), MSG_NOSIGNAL | MSG_DONTWAIT);
+    if (sent < 0 && errno != EAGAIN) return fd_.reset();
+    if (sent > 0) bytes.erase(0, static_cast<std::size_t>(sent));
+  }
+  bool is_connected() const { return static_cast<bool>(fd_); }
   // Whatever comes; false: nothing more.
   bool receive(std::size_t bytes) {
     static std::vector<char> space(1U << 20);
@@ -167,6 +176,72 @@ void set_property(Request& request) {
 template <class Request>
 void get_property(Request& request) {
   request.mutable_get_property()->mutable_id()->set_name("s1");
+}
+
+// --- small samples over many connections of one peer
+
+// The other host of this benchmark has some of the connections of the same address.
+constexpr int kConnections = 120;
+
+std::string open_small() {
+  return wire::encode_frame(test::with_serial(1, test::open_frame("small")));
+}
+
+class Publisher {
+ public:
+  Publisher(const std::string& address, int number)
+      : to_(Hostile::remote(address)), number_(static_cast<std::uint64_t>(number)) {}
+
+  void go_on() {
+    if (!to_.is_connected()) begin();
+    if (rest_.empty()) add_samples();
+    to_.send_part(rest_);
+    to_.receive_some();
+  }
+
+ private:
+  void begin() {
+    rest_ = open_small() +
+            wire::encode_frame(test::with_serial(2, test::start_publishing_frame(number_)));
+  }
+  void add_samples() {
+    for (int i = 0; i < 1000; ++i) {
+      const test::Bytes bytes =
+          test::sample_bytes({next_, time_from_ns(next_), Duration()}, test::Bytes(8), 0);
+      rest_.append(reinterpret_cast<const char*>(bytes.data()), bytes.size());
+      ++next_;
+    }
+  }
+
+  Hostile to_;
+  const std::uint64_t number_;
+  Tid next_ = 0;
+  std::string rest_;
+};
+
+void publish_small(const std::string& address) {
+  std::vector<Publisher> publishers;
+  for (int i = 0; i < kConnections; ++i) publishers.emplace_back(address, i + 1);
+  for (;;) {
+    for (Publisher& one : publishers) one.go_on();
+  }
+}
+
+void subscribe_to_small(const std::string& address) {
+  net::Frame subscribe;
+  subscribe.set_serial(2);
+  subscribe.mutable_subscribe()->set_from_now(true);
+  const std::string requests = open_small() + wire::encode_frame(subscribe);
+  std::vector<Hostile> readers;
+  for (int i = 0; i < kConnections - 1; ++i) {
+    readers.push_back(Hostile::remote(address));
+    readers.back().send(requests);
+  }
+  Publisher publisher(address, 1);
+  for (;;) {
+    publisher.go_on();
+    for (Hostile& one : readers) one.receive_some();
+  }
 }
 
 struct Attack {
@@ -311,6 +386,10 @@ const std::vector<Attack>& attacks() {
            for (Hostile& one : many) one.send_some(frame);
          }
        }},
+      {"120 connections publish samples of 8 B",
+       [](const std::string&, const std::string& address) { publish_small(address); }},
+      {"119 connections subscribe to samples of 8 B",
+       [](const std::string&, const std::string& address) { subscribe_to_small(address); }},
       {"peers send garbage and come again",
        [](const std::string&, const std::string& address) {
          Hostile hostile = Hostile::remote(address);
@@ -401,6 +480,8 @@ int main(int argc, char** argv) {
   measure("no attack", *owner, writer, result, {});
   const std::vector<RawWriter> streams = long_streams(session);
   measure("no attack, 1001 streams", *owner, writer, result, {});
+  const RawWriter small =
+      session.create_raw({"small", 0, ""}, {"", 8, 1, {}}, History{10'000, 1ms}).value();
   for (const Attack& attack : attacks()) {
     if (!is_wanted(attack.name, argc, argv)) continue;
     measure(attack.name, *owner, writer, result, [&] { attack.run(socket, address); });

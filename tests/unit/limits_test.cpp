@@ -41,6 +41,7 @@
 #include "daemon/remote/remote_writer.hpp"
 #include "daemon/serve/data_communicator.hpp"
 #include "daemon/serve/peer_table.hpp"
+#include "daemon/serve/stream_channel.hpp"
 #include "daemon/service/config.hpp"
 #include "daemon/streams/descriptor_store.hpp"
 #include "daemon/streams/stream.hpp"
@@ -89,6 +90,7 @@ Values values_of_the_code() {
       {"max_connections", count(config.max_connections)},
       {"max_connections_per_host", count(config.max_connections_per_host)},
       {"max_peer_memory", bytes(config.max_peer_memory_bytes)},
+      {"PeerTable::Limits::all_bytes()", count(PeerTable::kFullPeers) + " times max_peer_memory"},
       {"PConnectorOptions::max_unsent_samples", count(remote.max_unsent_samples)},
       {"PConnectorOptions::max_unsent_bytes", bytes(remote.max_unsent_bytes)},
       {"PConnectorOptions::request_timeout", time(remote.request_timeout)},
@@ -167,7 +169,9 @@ Values values_of_the_code() {
       DSSM_BYTES(FrameConnection::kBytesPerTurn),
       DSSM_BYTES(wire::FrameDecoder::kCollectedPerReceive),
       DSSM_COUNT(FrameConnection::kReceivesPerTurn),
+      DSSM_COUNT(FrameConnection::kSamplesPerTurn),
       DSSM_BYTES(SamplePump::kBytesPerTurn),
+      DSSM_COUNT(StreamChannel::kMaxFinds),
       DSSM_COUNT(SamplePump::kSamplesPerTurn),
       DSSM_COUNT(Acceptor::kConnectionsPerTurn),
       DSSM_COUNT(Peers::kMaxFoundHosts),

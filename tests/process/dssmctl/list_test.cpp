@@ -319,7 +319,7 @@ TEST_F(Info, ShowsHowMuchOfEachLimitIsUsed) {
   EXPECT_EQ(limit("long messages"), counted("long messages", 0, 256 << 20, "bytes"));
   EXPECT_EQ(limit("max_connections"), counted("max_connections", 0, 256, "connections"));
   EXPECT_EQ(limit("max_peer_memory"), counted("max_peer_memory", 0, 96 << 20, "bytes"));
-  EXPECT_EQ(info["limits"].size(), 14U);
+  EXPECT_EQ(info["limits"].size(), 15U);
   const std::string text = output({"info"});
   EXPECT_TRUE(std::regex_search(text, std::regex("\nLIMIT +USED +OF +UNIT\n"))) << text;
   EXPECT_TRUE(std::regex_search(text, std::regex("\nmax_streams +1 +4096 +streams\n"))) << text;

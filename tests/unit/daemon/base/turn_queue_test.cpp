@@ -48,6 +48,18 @@ TEST_F(TurnQueueTest, LetsAClientBeginAtOnceUntilTheTimeIsUsedUp) {
   EXPECT_EQ(called, "12");
 }
 
+TEST_F(TurnQueueTest, CountsWorkWithinOtherWorkOnce) {
+  Client one(*this, "a", "1");
+  {
+    const TurnQueue::Work outer(queue);
+    { const TurnQueue::Work inner(queue); }
+    EXPECT_TRUE(one.turn.may_begin());
+    work();
+    EXPECT_FALSE(one.turn.may_begin(TurnQueue::Reason::event));
+  }
+  EXPECT_FALSE(one.turn.may_begin());
+}
+
 TEST_F(TurnQueueTest, ServesOneAccountAfterAnotherHoweverManyClientsEachHas) {
   Client a1(*this, "a", "1"), a2(*this, "a", "2"), a3(*this, "a", "3"), b(*this, "b", "b");
   for (Client* one : {&a1, &a2, &a3, &b}) one->turn.wait();

@@ -3,6 +3,8 @@
 // Remote writers against an owner that does what the test says.
 #include <gtest/gtest.h>
 
+#include <new>
+
 #include "core/ring/ring_writer.hpp"
 #include "daemon/remote/remote_writer.hpp"
 #include "tests/unit/daemon/remote/remote_stream_test.hpp"
@@ -82,6 +84,35 @@ class RemoteWritersTest : public RemoteStreamTest<RemoteWriter> {
     return times;
   }
 };
+
+// One program waits whose first answer finds no memory, and then another one.
+class RemoteWritersWithoutMemory : public RemoteWritersTest {
+ protected:
+  void open_both() {
+    streams->open(owner->host(), kOdometry, &plan, [this](const Result<OpenedRing>& result) {
+      if (++calls == 1) throw std::bad_alloc();
+      ASSERT_FALSE(result);
+      failed_with = result.error().code;
+    });
+    other = open(&plan);
+  }
+  int calls = 0;
+  std::optional<Errc> failed_with;
+  std::shared_ptr<Answer> other;
+};
+
+TEST_F(RemoteWritersWithoutMemory, AnswerOthersWhenTheOwnerAnswers) {
+  open_both();
+  serve(-1, true);
+  EXPECT_TRUE(wait(other).stream);
+  EXPECT_EQ(failed_with, Errc::no_memory);
+}
+
+TEST_F(RemoteWritersWithoutMemory, AnswerOthersWhenTheOwnerDoesNot) {
+  open_both();
+  EXPECT_EQ(wait_error(other).code, Errc::unavailable);
+  EXPECT_EQ(failed_with, Errc::no_memory);
+}
 
 TEST_F(RemoteWritersTest, CreatesTheStreamAtItsOwnerAndPublishes) {
   const auto answer = open(&plan);

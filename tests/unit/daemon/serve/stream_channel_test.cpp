@@ -4,8 +4,13 @@
 // end.
 #include "daemon/serve/stream_channel.hpp"
 
+#include <algorithm>
+#include <ctime>
+#include <iterator>
+#include <new>
 #include <thread>
 
+#include "daemon/base/turn_queue.hpp"
 #include "tests/unit/daemon/remote/fake_clock_assessor.hpp"
 #include "tests/unit/daemon/serve/server_rig.hpp"
 
@@ -149,6 +154,60 @@ TEST_F(StreamChannelTest, ReportsItsRange) {
   EXPECT_EQ(range.at_tid(), 15);
   frame.mutable_get_range()->clear_time_ns();
   EXPECT_EQ(ask(frame).at(0).range().at_tid(), -1);
+}
+
+// Runs whose links never end, as a hostile writer makes them: each search gives up.
+class SearchWithoutEnd : public StreamChannelTest {
+ protected:
+  void SetUp() override {
+    rig.connect(peer);
+    stream = rig.create("runs", kBytes, 1024);
+    rig.write(*stream, 600);
+    const OfferedFiles files = as_offer(stream->descriptors_for(Role::writer).value());
+    const auto mapping =
+        ring::RingMapping::open_untrusted(files.ring.get(), ring::Access::read_write).value();
+    const ring::SlotTable slots(*mapping);
+    for (Tid tid = 0; tid < 600; ++tid) {
+      ring::SlotHeader& slot = slots.slot(tid);
+      slot.run_start = tid;
+      slot.run_parent = slot.run_jump = tid - 1;
+    }
+    mapping->header().run_start = 599;
+    rig.open(peer, "runs");
+  }
+  static Duration processor_time(const std::function<void()>& work) {
+    const auto used = [] {
+      timespec time{};
+      ::clock_gettime(CLOCK_THREAD_CPUTIME_ID, &time);
+      return std::chrono::seconds(time.tv_sec) + std::chrono::nanoseconds(time.tv_nsec);
+    };
+    const auto before = used();
+    work();
+    return used() - before;
+  }
+};
+
+TEST_F(SearchWithoutEnd, TakesLittleOfATurn) {
+  constexpr std::int64_t kBeforeAll = 1;
+  const ring::RingReader reader(stream->mapping());
+  Tid tid = kNoTid;
+  const Duration all_retries = processor_time(
+      [&] { EXPECT_EQ(reader.find(time_from_ns(kBeforeAll), tid), ReadStatus::lapped); });
+  net::Frame range = with_serial(1);
+  range.mutable_get_range()->set_time_ns(kBeforeAll);
+  const Duration taken =
+      processor_time([&] { EXPECT_EQ(ask(range).at(0).range().at_tid(), kNoTid); });
+  EXPECT_LT(10 * taken, all_retries);
+}
+
+TEST_F(SearchWithoutEnd, GoesOnInLaterTurnsAndIsGivenUp) {
+  net::Frame frame = with_serial(2);
+  frame.mutable_read()->set_time_ns(1);
+  EXPECT_TRUE(ask(frame).empty()) << "after 8 turns";
+  rig.turns(200);
+  const std::vector<net::Frame> answers = peer.take();
+  ASSERT_EQ(answers.size(), 1U);
+  EXPECT_EQ(answers[0].no_sample().status(), static_cast<std::uint32_t>(ReadStatus::lapped));
 }
 
 // --- subscriptions
@@ -447,6 +506,32 @@ TEST_F(StreamChannelTest, BringsPublishedSamplesToOtherChannels) {
   EXPECT_EQ(words(reader.take()), "0");
 }
 
+TEST_F(StreamChannelTest, EndsAloneWhenASampleFindsNoMemory) {
+  start_publishing(11);
+  MemoryPeer without_memory, other;
+  for (MemoryPeer* reader : {&without_memory, &other}) {
+    rig.connect(*reader);
+    rig.open(*reader, "odometry");
+    net::Frame frame = with_serial(60);
+    frame.mutable_subscribe()->set_from_now(true);
+    reader->put(frame);
+    rig.turns();
+    EXPECT_EQ(words(reader->take()), "subscribed:0 caught_up");
+  }
+  bool has_thrown = false;
+  without_memory.after_send = [&] {
+    if (!std::exchange(has_thrown, true)) throw std::bad_alloc();
+  };
+  for (const Tid tid : {0, 1}) {
+    peer.put(sample_frame(tid));
+    rig.turns();
+    EXPECT_EQ(words(other.take()), std::to_string(tid));
+  }
+  EXPECT_TRUE(has_thrown);
+  EXPECT_TRUE(without_memory.closed);
+  EXPECT_FALSE(peer.closed) << "the publisher, whose sample it was";
+}
+
 TEST_F(StreamChannelTest, RefusesSamplesBeforeStartPublishing) {
   peer.put(sample_frame(0));
   rig.turns();
@@ -497,6 +582,74 @@ TEST_F(StreamChannelTest, HoldsNoMoreForAPublisherThanItsHostMay) {
   EXPECT_EQ(refused.failure().code(), "limit_exceeded");
   EXPECT_NE(refused.failure().message().find("max_peer_memory"), std::string::npos);
   EXPECT_NE(refused.failure().message().find("'camera:0@pc1'"), std::string::npos);
+}
+
+// --- turns
+
+// Four channels, and each frame that one of them is sent takes the time that all have in a turn.
+class SlowChannels : public StreamChannelTest {
+ protected:
+  void begin(const std::function<net::Frame(std::uint64_t number)>& request) {
+    for (std::uint64_t i = 0; i < std::size(peers); ++i) {
+      rig.connect(peers[i]);
+      rig.open(peers[i], "odometry");
+      peers[i].put(request(i));
+      rig.turns();
+      EXPECT_FALSE(peers[i].take().empty());
+      peers[i].after_send = [] {
+        for (const MonoTime begin = MonoClock::now();
+             MonoClock::now() - begin < TurnQueue::kMaxTurn;) {
+        }
+      };
+    }
+  }
+  // In one turn of the loop: one at once, and one of those that waited.
+  void expect_served_in_turns() {
+    const auto served = [this] {
+      return std::count_if(std::begin(peers), std::end(peers),
+                           [](const MemoryPeer& one) { return !one.sent.empty(); });
+    };
+    for (int turn = 0; turn < 20 && served() < 4; ++turn) {
+      const auto before = served();
+      rig.turns(1);
+      EXPECT_LE(served() - before, 2);
+    }
+    EXPECT_EQ(served(), 4);
+  }
+  MemoryPeer peers[4];
+};
+
+TEST_F(SlowChannels, AreSentSamplesInTurns) {
+  begin([](std::uint64_t) {
+    net::Frame frame = with_serial(60);
+    frame.mutable_subscribe()->set_from_now(true);
+    return frame;
+  });
+  rig.write(*stream);
+  expect_served_in_turns();
+}
+
+TEST_F(SlowChannels, HaveTheirSamplesTakenInTurns) {
+  begin([](std::uint64_t number) { return start_publishing_request(20 + number); });
+  for (MemoryPeer& one : peers) one.put(sample_frame(0));
+  expect_served_in_turns();
+  EXPECT_EQ(ring::RingReader(stream->mapping()).newest(), 3);
+}
+
+TEST_F(StreamChannelTest, TakesManySmallSamplesInSeveralTurns) {
+  start_publishing(11);
+  constexpr int kSamples = 20'000;
+  Bytes samples;
+  for (int i = 0; i < kSamples; ++i) {
+    const Bytes one = sample_frame(i);
+    samples.insert(samples.end(), one.begin(), one.end());
+  }
+  peer.max_receive_bytes = 16U << 10;
+  peer.put(samples);
+  rig.turns(1);
+  const ring::RingReader reader(stream->mapping());
+  EXPECT_LT(reader.newest(), 2 * Tid{FrameConnection::kSamplesPerTurn});
+  run_until(rig.loop, [&] { return reader.newest() == kSamples - 1; });
 }
 
 // --- property

@@ -59,12 +59,39 @@ TEST(PeerTable, DoesNotCountConfiguredPeers) {
   EXPECT_TRUE(table.is_full());
 }
 
+TEST(PeerTable, BoundsTheMemoryOfAllPeersButConfiguredOnes) {
+  constexpr std::uint64_t kPeerBytes = 2 * PeerTable::kConnectionBytes;
+  PeerTable table({100, 100, kPeerBytes});
+  std::vector<PeerPlace> places;
+  const auto admit = [&](const std::string& peer, bool is_configured = false) {
+    Result<PeerPlace> place = table.admit(peer, false, is_configured);
+    if (place) places.push_back(*std::move(place));
+    return place ? std::string() : place.error().message;
+  };
+  for (std::uint64_t i = 0; i < 2 * PeerTable::kFullPeers; ++i) {
+    EXPECT_FALSE(table.is_full());
+    EXPECT_EQ(admit("peer " + std::to_string(i)), "");
+  }
+  EXPECT_TRUE(table.is_full());
+  EXPECT_NE(admit("one more").find(std::to_string(PeerTable::kFullPeers * kPeerBytes)),
+            std::string::npos);
+  EXPECT_FALSE(places.front().budget().try_take(1)) << "has half of its own left";
+  EXPECT_EQ(admit("pc2", true), "") << "a configured one";
+  EXPECT_TRUE(places.back().budget().try_take(1));
+  LimitUses limits;
+  table.add_limits(limits);
+  EXPECT_EQ(limits.back().used, PeerTable::kFullPeers * kPeerBytes);
+  EXPECT_EQ(limits.back().limit, PeerTable::kFullPeers * kPeerBytes);
+  table.set_limits({100, 100, kPeerBytes, 80 * kPeerBytes});
+  EXPECT_EQ(admit("one more"), "") << "an eighth of the machine's memory";
+}
+
 TEST(PeerTable, ShowsWhatThePeerWithTheMostUses) {
   PeerTable table({5, 4, 1U << 20});
   const PeerPlace one = *table.admit("pc2"), two = *table.admit("pc2"), other = *table.admit("pc3");
   LimitUses limits;
   table.add_limits(limits);
-  ASSERT_EQ(limits.size(), 3U);
+  ASSERT_EQ(limits.size(), 4U);
   EXPECT_EQ(limits[0].name, "max_connections");
   EXPECT_EQ(limits[0].used, 3U);
   EXPECT_EQ(limits[0].limit, 5U);
