@@ -6,6 +6,7 @@
 
 #include <cmath>
 #include <ctime>
+#include <optional>
 
 #include "client/dssmctl/black_box_streams.hpp"
 #include "client/dssmctl/text.hpp"
@@ -27,11 +28,38 @@ std::string note(const HostInfo& host) {
   return text;
 }
 
+// What comes to a mirror whose network does not carry what is asked for.
+struct Carried {
+  double samples_per_s = 0, asked_per_s = 0, bytes_per_s = 0;
+};
+
+std::optional<Carried> carried_of(const StreamInfo& stream) {
+  if (!stream.mirror || stream.mirror->recent_lost_samples == 0) return {};
+  // What was counted before the owner was down says nothing of the network now.
+  const MirrorInfo& mirror = *stream.mirror;
+  if (!gets_samples(mirror) || stream.rate_hz <= 0) return {};
+  const double share = 1 - static_cast<double>(mirror.recent_lost_samples) /
+                               static_cast<double>(mirror.recent_samples);
+  Carried carried{share * stream.rate_hz, stream.rate_hz};
+  if (mirror.max_rate_hz > 0) {
+    constexpr double kClearly = 0.8;  // timers come late, so the rate is a little lower anyway
+    carried.asked_per_s = std::min(mirror.max_rate_hz, stream.rate_hz);
+    if (carried.samples_per_s >= kClearly * carried.asked_per_s) return {};
+  }
+  // Samples may have different lengths: as long as those that came are on the whole.
+  if (mirror.received_samples > 0) {
+    carried.bytes_per_s = carried.samples_per_s * static_cast<double>(mirror.received_bytes) /
+                          static_cast<double>(mirror.received_samples);
+  }
+  return carried;
+}
+
 }  // namespace
 
 Json mirror_json(const StreamInfo& stream) {
   const MirrorInfo& mirror = *stream.mirror;
   const Duration behind = behind_owner(stream);
+  const std::optional<Carried> carried = carried_of(stream);
   const bool is_behind = mirror.state == MirrorState::live && behind > Duration();
   return {{"state", is_behind ? "behind" : name_of(mirror.state)},
           {"behind_ns", to_ns(behind)},
@@ -44,6 +72,7 @@ Json mirror_json(const StreamInfo& stream) {
           {"history_wanted", mirror.history_wanted},
           {"recent_samples", mirror.recent_samples},
           {"recent_lost_samples", mirror.recent_lost_samples},
+          {"carried_bytes_per_s", carried ? Json(std::llround(carried->bytes_per_s)) : Json()},
           {"depth", mirror.depth > 0 ? Json(mirror.depth) : Json()},
           {"max_rate_hz", mirror.max_rate_hz > 0 ? Json(mirror.max_rate_hz) : Json()},
           {"reconnects", mirror.reconnects},
@@ -245,21 +274,14 @@ bool gets_samples(const MirrorInfo& mirror) {
 }
 
 std::string carried_text(const StreamInfo& stream) {
-  if (!stream.mirror || stream.mirror->recent_lost_samples == 0) return {};
-  // What was counted before the owner was down says nothing of the network now.
-  if (!gets_samples(*stream.mirror) || stream.rate_hz <= 0) return {};
-  const double share = 1 - static_cast<double>(stream.mirror->recent_lost_samples) /
-                               static_cast<double>(stream.mirror->recent_samples);
-  const double carried_hz = share * stream.rate_hz;
-  const double max_rate_hz = stream.mirror->max_rate_hz;
-  if (max_rate_hz == 0) {
-    return fmt::format("carries {:.3g} of {:.3g} samples a second", carried_hz, stream.rate_hz);
-  }
-  constexpr double kClearly = 0.8;  // timers come late, so the rate is a little lower anyway
-  const double wanted_hz = std::min(max_rate_hz, stream.rate_hz);
-  if (carried_hz >= kClearly * wanted_hz) return {};
-  return fmt::format("carries {:.3g} of the {:.3g} samples a second that are asked for", carried_hz,
-                     wanted_hz);
+  const std::optional<Carried> carried = carried_of(stream);
+  if (!carried) return {};
+  const std::string bytes =
+      carried->bytes_per_s > 0 ? fmt::format(" ({})", byte_rate_text(carried->bytes_per_s)) : "";
+  const bool has_rate = stream.mirror->max_rate_hz > 0;
+  return fmt::format("carries {:.3g} of {}{:.3g} samples a second{}{}", carried->samples_per_s,
+                     has_rate ? "the " : "", carried->asked_per_s,
+                     has_rate ? " that are asked for" : "", bytes);
 }
 
 std::string_view role_name(Role role) { return role == Role::writer ? "writer" : "reader"; }

@@ -61,7 +61,8 @@ void add_details(Json& json, const StreamInfo& stream);
 Duration behind_owner(const StreamInfo& stream);
 // Whether its owner sends it samples now. Its history may still be on its way.
 bool gets_samples(const MirrorInfo& mirror);
-// "carries 11 of 30 samples a second", of the network to the mirror; empty: it carries all.
+// "carries 11 of 30 samples a second (9.67 MiB/s)", of the network to the mirror; empty: it carries
+// all.
 std::string carried_text(const StreamInfo& stream);
 
 std::string_view role_name(Role role);

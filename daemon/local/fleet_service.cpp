@@ -220,27 +220,35 @@ void FleetService::open_reader(const StreamId& id, bool history, const std::stri
     const StreamId named = owned_by(**owner, id);
     const auto want = [&] {
       Mirror* mirror = history ? mirrors_.find(named) : nullptr;
-      if (mirror) mirror->want_history(true);
+      if (mirror) mirror->want_history();
     };
     want();  // so that open() waits for it
     mirrors_.open(
         **owner, id, nullptr,
-        [then = std::move(then)](Result<OpenedRing> ring) {
+        [this, named, history, then = std::move(then)](Result<OpenedRing> ring) {
           if (!ring) return then(std::move(ring).error());
-          then(std::move(ring->stream));
+          then(for_reader(named, history, std::move(ring->stream)));
         },
         account, history);
     return want();  // of a new mirror, which is not connected yet
   }
   if (Mirror* mirror = mirror_without_owner(id)) {
-    if (history) mirror->want_history(true);
-    if (std::shared_ptr<Stream> stream = mirror->acquire()) return then(std::move(stream));
+    if (std::shared_ptr<Stream> stream = mirror->acquire()) {
+      return then(for_reader(mirror->id(), history, std::move(stream)));
+    }
   }
   then(with_unavailable_peers(owner.error()));
 }
 
-void FleetService::want_history(const StreamId& id, bool always) {
-  if (Mirror* mirror = mirrors_.find(id)) mirror->want_history(always);
+// The ring of the mirror `id`, as a reader holds it.
+std::shared_ptr<Stream> FleetService::for_reader(const StreamId& id, bool history,
+                                                 std::shared_ptr<Stream> ring) const {
+  Mirror* mirror = history ? mirrors_.find(id) : nullptr;
+  return mirror ? mirror->with_history(ring) : ring;
+}
+
+void FleetService::want_history(const StreamId& id) {
+  if (Mirror* mirror = mirrors_.find(id)) mirror->want_history();
 }
 
 void FleetService::open_writer(const StreamId& id, const CreatePlan* plan,
@@ -251,10 +259,10 @@ void FleetService::open_writer(const StreamId& id, const CreatePlan* plan,
 }
 
 Result<std::shared_ptr<Stream>> FleetService::adopt_untrusted(const StreamId& id, Role role,
-                                                              OfferedFiles files,
+                                                              OfferedFiles files, bool history,
                                                               const std::string& account) {
-  return role == Role::writer ? writers_.adopt_untrusted(id, std::move(files), account)
-                              : mirrors_.adopt_untrusted(id, std::move(files), account);
+  if (role == Role::writer) return writers_.adopt_untrusted(id, std::move(files), account);
+  return for_reader(id, history, DSSM_TRY(mirrors_.adopt_untrusted(id, std::move(files), account)));
 }
 
 // --- about one stream

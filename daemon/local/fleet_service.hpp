@@ -63,10 +63,11 @@ class FleetService final : public Fleet, private CatalogObserver {
   void when_known(const StreamId& id, std::size_t bytes, std::function<void()> go_on) override;
   void open_reader(const StreamId& id, bool history, const std::string& account,
                    Then<std::shared_ptr<Stream>> then) override;
-  void want_history(const StreamId& id, bool always) override;
+  void want_history(const StreamId& id) override;
   void open_writer(const StreamId& id, const CreatePlan* plan, const std::string& account,
                    Then<OpenedRing> then) override;
   Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role role, OfferedFiles files,
+                                                  bool history,
                                                   const std::string& account) override;
   void forward(const StreamId& id, const local::Request& request,
                Then<local::Response> then) override;
@@ -101,6 +102,8 @@ class FleetService final : public Fleet, private CatalogObserver {
   Error with_unavailable_peers(Error error) const;
   Mirror* mirror_without_owner(const StreamId& id) const;
   std::optional<local::Response> describe_mirror(const StreamId& id) const;
+  std::shared_ptr<Stream> for_reader(const StreamId& id, bool history,
+                                     std::shared_ptr<Stream> ring) const;
   std::vector<const KnownHost*> hosts_by_name() const;
   void ask_all(const net::Frame& request, std::function<void(Answers)> then,
                std::function<void(const Error&)> fail);

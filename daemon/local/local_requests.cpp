@@ -111,7 +111,7 @@ Result<Reply> LocalRequests::serve_untrusted(const Client& client, const local::
     }
     case local::Request::kWantHistory: {
       const StreamId id = DSSM_TRY(wire::stream_id_untrusted(request.want_history().id()));
-      if (fleet_) fleet_->want_history(id, false);
+      if (fleet_) fleet_->want_history(id);
       return done();
     }
     case local::Request::kOpenClock:
@@ -168,8 +168,8 @@ Result<Reply> LocalRequests::offer(const Client& client, const local::Offer& req
   files.may_create = rights_.check(*client, Action::create, id).has_value();
   const std::shared_ptr<Stream> stream =
       DSSM_TRY(is_own ? registry_.adopt_untrusted(id, std::move(files))
-                      : fleet_->adopt_untrusted(id, role, std::move(files), client->account()));
-  if (!is_own && request.history()) fleet_->want_history(id, true);
+                      : fleet_->adopt_untrusted(id, role, std::move(files), request.history(),
+                                                client->account()));
   return record_open({client, stream, role, request.tag(), request.any_host()});
 }
 

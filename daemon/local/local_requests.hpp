@@ -72,13 +72,13 @@ class Fleet {
 
   // The mirror of a stream, with its newest sample. Kept while its Stream is in the OpenTable, and
   // some seconds longer.
-  //   history  filled with what its owner's ring holds, as far as it has a place
+  //   history  filled with what its owner's ring holds, as far as it has a place; also after each
+  //            cut, while the result is held
   //   account  who is charged for a new mirror or remote writer, as Identity::account()
   virtual void open_reader(const StreamId& id, bool history, const std::string& account,
                            Then<std::shared_ptr<Stream>> then) = 0;
   // A program reads what is missing in the mirror of that stream; there may be none.
-  //   always  or wants it at once, now and later
-  virtual void want_history(const StreamId& id, bool always) = 0;
+  virtual void want_history(const StreamId& id) = 0;
 
   // A ring of this host that is published into the other host's stream.
   //   plan  create the stream there unless it exists, `id` names the host; nullptr: it must exist,
@@ -87,8 +87,9 @@ class Fleet {
                            Then<OpenedRing> then) = 0;
 
   // Takes back a mirror's or remote writer's ring that a program held while no dssmd ran.
+  //   history  as in open_reader()
   virtual Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role role,
-                                                          OfferedFiles files,
+                                                          OfferedFiles files, bool history,
                                                           const std::string& account) = 0;
 
   // Has the owner of the stream `id` serve `request`: Info, GetProperty, SetProperty, Describe or

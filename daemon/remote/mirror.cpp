@@ -82,12 +82,23 @@ double Mirror::wanted_rate_hz() const noexcept {
 }
 
 bool Mirror::wants_history() const noexcept {
-  return history_wanted_ || history_always_ || parts_.mirrors.demand_for(id_).history_at_once;
+  return history_wanted_ || history_use_.in_use() || parts_.mirrors.demand_for(id_).history_at_once;
 }
 
-void Mirror::want_history(bool always) {
-  history_always_ |= always;
+void Mirror::want_history() {
+  const bool is_live = channel_.reading() == ChannelClient::Reading::live;
+  if (is_live && with_history_ && ring_->filling_samples() == 0) return;  // it is here
   history_wanted_ = true;
+  subscribe_for_history();
+}
+
+std::shared_ptr<Stream> Mirror::with_history(const std::shared_ptr<Stream>& ring) {
+  std::shared_ptr<Stream> held = history_use_.acquire(ring);
+  subscribe_for_history();
+  return held;
+}
+
+void Mirror::subscribe_for_history() {
   if (!with_history_ && channel_.reading() >= ChannelClient::Reading::filling) subscribe();
 }
 
@@ -106,7 +117,7 @@ std::uint64_t Mirror::depth_for(const StreamInfo& theirs) const noexcept {
 }
 
 void Mirror::on_new_demand() {
-  if (parts_.mirrors.demand_for(id_).history_at_once) want_history(false);
+  if (parts_.mirrors.demand_for(id_).history_at_once) want_history();
   const bool is_answered = channel_.reading() >= ChannelClient::Reading::filling;
   if (is_answered && max_rate_hz_ != wanted_rate_hz()) subscribe();
 }

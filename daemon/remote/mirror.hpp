@@ -3,9 +3,9 @@
 // The copy of one stream of another host: one channel to its owner and one ring here, for any
 // number of programs that read it. The newest sample comes first, and what is written from then on.
 // What was written before, or while there was no connection, is fetched when a program reads it or
-// asked for it with its open: want_history(). Until then it is the ring's hole. A program that
-// opens the stream gets the ring when what is fetched is here, or after kFillTimeout. While the
-// owner is away, those that read one sample after the other wait before what is missing.
+// asked for it with its open: want_history(), with_history(). Until then it is the ring's hole. A
+// program that opens the stream gets the ring when what is fetched is here, or after kFillTimeout.
+// While the owner is away, those that read one sample after the other wait before what is missing.
 //
 //   ring      has the owner's type, cycle and incarnation, and its depth or, by the key
 //             mirror_streams, less. When the owner's stream has another incarnation, the mirror
@@ -43,8 +43,10 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
   Mirror(const ChannelParts& parts, StreamId id, RingQuota quota, std::function<void()> on_done);
 
   // Fetches what is missing in the ring, also after a reconnect, until that has come once.
-  //   always  and from then on at once
-  void want_history(bool always);
+  void want_history();
+  // The ring for a program that wants history at once: what is missing is fetched, also after each
+  // reconnect, while the program holds the result.
+  std::shared_ptr<Stream> with_history(const std::shared_ptr<Stream>& ring);
   // ChannelParts::mirrors has changed.
   void on_new_demand();
 
@@ -105,13 +107,16 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
   bool wants_history() const noexcept;
   double wanted_rate_hz() const noexcept;
   void subscribe();
+  void subscribe_for_history();
   bool is_filling() const noexcept;
   proto::Mirror::State shown_state() const noexcept;
 
   bool newest_first_ = false;  // the owner has that feature
   Tid fresh_from_ = kNoTid;    // the owner's newest sample when it was asked
   bool is_fresh_ = false;      // that one, or a newer one, has come on this connection
-  bool history_wanted_ = false, history_always_ = false;
+  // History is wanted until it has come once, and while there are programs that want it at once.
+  bool history_wanted_ = false;
+  UseCount history_use_{[] {}};
   bool with_history_ = false;   // the present subscription, and
   double max_rate_hz_ = 0;      // its rate; 0: all samples
   bool is_shorter_ = false;     // the ring, than the owner's

@@ -9,7 +9,8 @@
 // that fills the same link. Beside these, bare TCP: small messages, and a connection that sends as
 // much as 85 % of the link carries with both.
 //
-// Arguments: "camera" or "encoder" for one of them; then the links in MB/s, if not all.
+// Arguments: "camera" or "encoder" for one of them; "far" for links with 20 ms of round trip, all
+// of it on the way back; then the links in MB/s, if not all.
 //
 // The network namespaces of both hosts have one clock, so ages are exact. TCP's congestion control
 // is Debian's default, cubic.
@@ -37,6 +38,7 @@ constexpr Duration kHistory = 5s;
 constexpr Duration kCut = 20s;     // much longer than the history
 constexpr Duration kWatched = 4s;  // after an event
 constexpr Duration kPoll = 1ms;
+constexpr Duration kFar = 20ms;
 // With the headers of Ethernet, IP and TCP.
 constexpr double kHeaderBytes = 66, kLargestPacket = 1514;
 
@@ -124,9 +126,9 @@ Figures raw_ages(const Hosts& hosts) {
 // --- ours
 
 void print_ages(const std::string& name, const Figures& raw, const std::vector<double>& ages,
-                double link_ns) {
+                double link_ns, Duration round_trip) {
   const Figures figures = figures_of(ages);
-  const double target = 2 * link_ns + static_cast<double>(to_ns(5ms)) +
+  const double target = 2 * link_ns + static_cast<double>(to_ns(5ms + round_trip)) +
                         static_cast<double>(to_ns(kPeriod));  // a frame may be as old when sent
   char rest[96];
   std::snprintf(rest, sizeof rest, "%7.2f  p99 <= %ld ms", figures.median / raw.median,
@@ -134,13 +136,20 @@ void print_ages(const std::string& name, const Figures& raw, const std::vector<d
   print_ms(name, figures, rest);
 }
 
-void measure_link(test::Network& network, const Hosts& hosts, int megabytes_per_s) {
+// For the names of rows.
+std::string tail_of(int megabytes_per_s, Duration round_trip) {
+  return ", " + std::to_string(megabytes_per_s) + " MB/s" +
+         (round_trip > Duration() ? ", far" : "") + " [ms]";
+}
+
+void measure_link(test::Network& network, const Hosts& hosts, int megabytes_per_s,
+                  Duration round_trip) {
   const std::string rate = std::to_string(megabytes_per_s * 8) + "mbit";
   if (auto shaped = network.shape(2, "tbf rate " + rate + " burst 256kb latency 10ms"); !shaped) {
     std::printf("--- SKIPPED %d MB/s: %s\n", megabytes_per_s, shaped.error().message.c_str());
     return;
   }
-  const std::string tail = ", " + std::to_string(megabytes_per_s) + " MB/s [ms]";
+  const std::string tail = tail_of(megabytes_per_s, round_trip);
   const Figures raw = raw_ages(hosts);
   print_ms("  raw TCP, newest frame" + tail, raw);
   const auto owner = hosts.start_owner("error");
@@ -163,8 +172,8 @@ void measure_link(test::Network& network, const Hosts& hosts, int megabytes_per_
     };
     const double link_ns = static_cast<double>(kFrameBytes) * 1e3 / megabytes_per_s *
                            kLargestPacket / (kLargestPacket - kHeaderBytes);
-    print_ages("just after opening" + tail, raw, watch(kWatched, newest), link_ns);
-    print_ages("later" + tail, raw, watch(kWatched, newest), link_ns);
+    print_ages("just after opening" + tail, raw, watch(kWatched, newest), link_ns, round_trip);
+    print_ages("later" + tail, raw, watch(kWatched, newest), link_ns, round_trip);
     const auto print_first = [&](const std::string& after) {
       SampleInfo before, info;
       static_cast<void>(reader.read_newest(frame, before));
@@ -184,7 +193,7 @@ void measure_link(test::Network& network, const Hosts& hosts, int megabytes_per_
     std::this_thread::sleep_for(kCut);
     network.heal(2);
     print_first("cut");
-    print_ages("from then on" + tail, raw, watch(kWatched, newest), link_ns);
+    print_ages("from then on" + tail, raw, watch(kWatched, newest), link_ns, round_trip);
   }
   end_child(writer);
 }
@@ -314,10 +323,11 @@ std::vector<double> one_way_times(RawReader& encoder, Duration how_long) {
   return times;
 }
 
-void measure_beside(test::Network& network, const Hosts& hosts, int megabytes_per_s) {
+void measure_beside(test::Network& network, const Hosts& hosts, int megabytes_per_s,
+                    Duration round_trip) {
   const std::string rate = std::to_string(megabytes_per_s * 8) + "mbit";
   if (!network.shape(2, "tbf rate " + rate + " burst 256kb latency 10ms")) return;
-  const std::string tail = ", " + std::to_string(megabytes_per_s) + " MB/s [ms]";
+  const std::string tail = tail_of(megabytes_per_s, round_trip);
   measure_raw_beside(hosts, megabytes_per_s, tail);
   const auto owner = hosts.start_owner("error");
   const std::string socket = owner->socket_path();
@@ -368,17 +378,27 @@ int main(int argc, char** argv) {
   print_head();
   std::string which;
   std::vector<int> links;
+  Duration round_trip{};
   for (int i = 1; i < argc; ++i) {
     const int link = std::atoi(argv[i]);
     if (link > 0) {
       links.push_back(link);
+    } else if (argv[i] == std::string("far")) {
+      round_trip = kFar;
     } else {
       which = argv[i];
     }
   }
   if (links.empty()) links = {1, 10, 60, 110};
+  if (round_trip > Duration()) {
+    const std::string delay = std::to_string(round_trip / 1ms) + "ms limit 100000";
+    if (const auto far = shaped.shape(1, "netem delay " + delay); !far) {
+      std::printf("--- SKIPPED: %s\n", far.error().message.c_str());
+      return 0;
+    }
+  }
   for (const int megabytes_per_s : links) {
-    if (which != "encoder") measure_link(shaped, hosts, megabytes_per_s);
-    if (which != "camera") measure_beside(shaped, hosts, megabytes_per_s);
+    if (which != "encoder") measure_link(shaped, hosts, megabytes_per_s, round_trip);
+    if (which != "camera") measure_beside(shaped, hosts, megabytes_per_s, round_trip);
   }
 }

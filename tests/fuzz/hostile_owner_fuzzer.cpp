@@ -154,9 +154,12 @@ class Programs {
     static_cast<void>(
         host_.catalog.stream_added(owner_.host().greeting.host_id, std::move(stream)));
   }
-  void want_history(bool always) {
+  void want_history(bool while_held) {
     if constexpr (std::is_same_v<Kind, Mirror>) {
-      if (Mirror* mirror = streams_.find(kStream)) mirror->want_history(always);
+      Mirror* mirror = streams_.find(kStream);
+      if (!mirror) return;
+      if (!while_held) return mirror->want_history();
+      if (!rings_.empty()) rings_.back() = mirror->with_history(rings_.back());
     }
   }
   void use_rings() {

@@ -28,7 +28,7 @@ class LateFleet final : public Fleet {
                    Then<std::shared_ptr<Stream>> then) override {
     due_.push_back([this, id, then = std::move(then)] { then(ring(id)); });
   }
-  void want_history(const StreamId&, bool) override {}
+  void want_history(const StreamId&) override {}
   void open_writer(const StreamId& id, const CreatePlan* plan, const std::string&,
                    Then<OpenedRing> then) override {
     if (plan) replace(id);
@@ -39,7 +39,7 @@ class LateFleet final : public Fleet {
     });
   }
   Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role, OfferedFiles files,
-                                                  const std::string&) override {
+                                                  bool, const std::string&) override {
     return pc2_.adopt_untrusted(id, std::move(files));
   }
   void forward(const StreamId& id, const local::Request& request,

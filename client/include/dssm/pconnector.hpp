@@ -81,6 +81,11 @@ struct Subscription {
   // > 0: at most so many per second, the newest one each time, however little the network carries.
   // 0: all, in their order: where the network carries less than is written, they come late.
   double max_rate_hz = 0;
+  // A value for max_rate_hz: each time that the network takes a sample, the newest one; also first,
+  // whatever `start` is. What is left out is not counted as lost. Of samples that are written
+  // within a millisecond some may be left out on any network. A program that reads late first gets
+  // what its connection holds.
+  static constexpr double kNewestOnly = 1e6;
 };
 
 class PConnector {

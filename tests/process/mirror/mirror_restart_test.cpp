@@ -99,6 +99,31 @@ TEST_F(TwoHosts, KeepTheHistoryWhileTheOwnerIsUnavailable) {
   }
 }
 
+TEST_F(TwoHosts, FetchWhatWasWrittenMeanwhileOnlyWhileAProgramWantsItAtOnce) {
+  auto writer = here.create<Numbered>("load", kLong).value();
+  for (int i = 0; i < 100; ++i) writer.write(numbered(i));
+  auto plain = there.await_reader<Numbered>("load", kNever).value();
+  std::optional<Session> another = connect(pc2);
+  auto reader =
+      std::optional(another->open_reader<Numbered>("load", FetchHistory::at_once).value());
+  const auto is_fetched = [&] {
+    pc1.kill_hard();
+    for (int i = 0; i < 10; ++i) writer.write(numbered(writer.newest_tid() + 1));
+    pc1.start();
+    EXPECT_EQ(plain.wait_for_sample(writer.newest_tid(), kNever), WaitStatus::ready);
+    await([&] { return mirror("load").state == MirrorState::live; });
+    return mirror("load").filling_samples == 0;
+  };
+  EXPECT_TRUE(is_fetched());
+  reader.reset();
+  another.reset();
+  await([&] {
+    const auto info = here.stream_info({"load", 0, ""});
+    return info && info->readers == 1;
+  });
+  EXPECT_FALSE(is_fetched());
+}
+
 TEST_F(TwoHosts, CountExactlyWhatTheOwnersRingLostMeanwhile) {
   auto writer = here.create<Numbered>("short", History{64, 1ms}).value();
   auto reader = open_filled<Numbered>(there, "short");

@@ -89,10 +89,12 @@ void Follower::check(const SampleInfo& info) {
           " are missing, and " + std::to_string(counted) + " were counted");
   }
   // Queried after the loss: the samples of the ring now were in it when they were counted as lost.
-  if (left_out > 0 && owner_ && !is_thinned_ && owner_->oldest_tid() < info.tid) {
+  const Tid oldest = left_out > 0 && owner_ ? owner_->oldest_tid() : info.tid;
+  if (oldest < info.tid && is_thinned_) {
+    lost_though_held_ += std::min(left_out, static_cast<std::uint64_t>(info.tid - oldest));
+  } else if (oldest < info.tid) {
     fault("tids " + std::to_string(last_ + 1) + " to " + std::to_string(info.tid - 1) +
-          " were lost, and the owner's ring holds those from " +
-          std::to_string(owner_->oldest_tid()));
+          " were lost, and the owner's ring holds those from " + std::to_string(oldest));
   }
   last_ = info.tid;
   lost_ += left_out;

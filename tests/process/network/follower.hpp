@@ -32,8 +32,10 @@ class Follower {
   RawReader& reader() { return std::get<RawReader>(source_); }
   PConnector& connector() { return std::get<PConnector>(source_); }
   const KnownStream& known() const { return known_; }
-  // The network carries less than the stream: what is lost may still be in the owner's ring.
+  // The network may carry less than the stream: what is lost may still be in the owner's ring, and
+  // is counted.
   void expect_thinning() { is_thinned_ = true; }
+  std::uint64_t lost_though_held() const { return lost_though_held_; }
   // The newest sample of the owner's ring has been taken.
   bool has_all() const { return owner_ && last_ == owner_->newest_tid(); }
 
@@ -62,7 +64,7 @@ class Follower {
   Tid first_ = 0, last_ = kNoTid;
   Tid first_taken_ = kNoTid;
   std::uint64_t lost_ = 0;  // as the source counted, up to `last_`
-  std::uint64_t taken_ = 0, restarts_ = 0;
+  std::uint64_t taken_ = 0, restarts_ = 0, lost_though_held_ = 0;
   int fault_count_ = 0;
   std::string faults_;
 };

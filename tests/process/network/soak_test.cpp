@@ -11,6 +11,7 @@
 #include <poll.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <csignal>
 #include <cstdio>
 #include <random>
@@ -31,6 +32,9 @@ constexpr int kOwners = 2;  // pc1 and pc2 own fifteen streams each; all hosts r
 // Samples that a PC may be too busy to carry for some seconds. What then waits in a ring as short
 // as those of such streams is given up, although the ring holds it for another second or two.
 constexpr std::uint64_t kLargeBytes = 256 << 10;
+// So many at most, for each of those taken: on a PC with ten times as much to do as it has cores
+// for, they were 0.0 and 3.6 % in two runs. Sanitizers were not measured.
+constexpr double kMostThinned = kSlowness > 1 ? 1 : 0.2;
 
 // For events that must happen even on a busy machine.
 constexpr Duration kTimeout = 3min;
@@ -173,15 +177,21 @@ class Soak : public NetworkTest {
     watchdog.join();
     EXPECT_FALSE(give_up) << "not all followers finished";
     std::uint64_t taken = 0, lost = 0, restarts = 0;
+    double most_thinned = 0;
     for (const auto& mine : followers) {
       for (const Follower& follower : mine) {
         EXPECT_EQ(follower.faults(), "");
         taken += follower.taken(), lost += follower.lost(), restarts += follower.restarts();
+        most_thinned = std::max(most_thinned, static_cast<double>(follower.lost_though_held()) /
+                                                  static_cast<double>(follower.taken() + 1));
       }
     }
-    std::printf("%d cuts, %d dssmds killed; %llu samples taken, %llu lost, %llu new rings\n", cuts,
-                kills, static_cast<unsigned long long>(taken),
-                static_cast<unsigned long long>(lost), static_cast<unsigned long long>(restarts));
+    std::printf(
+        "%d cuts, %d dssmds killed; %llu samples taken, %llu lost, %llu new rings; of a large "
+        "stream at most %.1f %% lost although its ring held them\n",
+        cuts, kills, static_cast<unsigned long long>(taken), static_cast<unsigned long long>(lost),
+        static_cast<unsigned long long>(restarts), 100 * most_thinned);
+    EXPECT_LE(most_thinned, kMostThinned);
   }
 
   // The state of a follower on `host`, and of its mirror, for messages.

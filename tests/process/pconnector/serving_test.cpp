@@ -213,6 +213,20 @@ TEST_F(PConnectorServing, TakesEverySampleOfAFastWriter) {
   EXPECT_EQ(counters.reconnects, 0u);
 }
 
+TEST_F(PConnectorServing, SendsTheNewestOnly) {
+  auto writer = make();
+  auto con = open();
+  for (Tid tid = 0; tid < 20; ++tid) write(writer, tid);
+  ASSERT_TRUE(con.subscribe(
+      {.start = Subscription::Start::oldest, .max_rate_hz = Subscription::kNewestOnly}));
+  expect_next(con, 19);
+  for (Tid tid = 20; tid < 30; ++tid) {
+    write(writer, tid);
+    expect_next(con, tid);
+  }
+  EXPECT_EQ(con.lost_samples(), 0u);
+}
+
 TEST_F(PConnectorServing, ThinsAtTheSource) {
   auto writer = make({1024, 1ms});
   auto con = open();

@@ -81,8 +81,27 @@ TEST(CarriedText, SaysNothingWhileTheOwnerIsDown) {
   EXPECT_EQ(carried_text(stream), "carries 11 of 30 samples a second");
   mirror.state = MirrorState::filling;
   EXPECT_EQ(carried_text(stream), "carries 11 of 30 samples a second");
+  EXPECT_EQ(mirror_json(stream)["carried_bytes_per_s"], 0) << "nothing has come yet";
   mirror.state = MirrorState::owner_unavailable;
   EXPECT_EQ(carried_text(stream), "");
+  EXPECT_TRUE(mirror_json(stream)["carried_bytes_per_s"].is_null());
+}
+
+TEST(CarriedText, SaysHowManyBytesThoseSamplesHave) {
+  StreamInfo stream;
+  stream.rate_hz = 30;
+  MirrorInfo& mirror = stream.mirror.emplace();
+  mirror.state = MirrorState::live;
+  EXPECT_TRUE(mirror_json(stream)["carried_bytes_per_s"].is_null()) << "it carries all";
+  mirror.recent_samples = 90;
+  mirror.recent_lost_samples = 57;
+  mirror.received_samples = 200;
+  mirror.received_bytes = 200 * 921'600ULL;
+  EXPECT_EQ(carried_text(stream), "carries 11 of 30 samples a second (9.67 MiB/s)");
+  EXPECT_EQ(mirror_json(stream)["carried_bytes_per_s"], 10'137'600);
+  mirror.max_rate_hz = 20;
+  EXPECT_EQ(carried_text(stream),
+            "carries 11 of the 20 samples a second that are asked for (9.67 MiB/s)");
 }
 
 TEST(HostJson, PrintsTheSameAsJson) {

@@ -150,6 +150,17 @@ TEST_F(SubscriberTest, DoesNotCountWhatWasLeftOutForTheRate) {
   EXPECT_EQ(subscriber.lost(), 5u);
 }
 
+TEST_F(SubscriberTest, TheNewestOnlyIsARateThatLeavesOutWithoutLoss) {
+  begin({.start = Subscription::Start::oldest, .max_rate_hz = Subscription::kNewestOnly});
+  EXPECT_EQ(request().max_rate_hz(), Subscription::kNewestOnly);
+  subscriber.set_buffering(true);
+  arrive(9);
+  arrive(12);
+  EXPECT_EQ(subscriber.lost(), 0u);
+  expect_kept(9);
+  expect_kept(12);
+}
+
 TEST_F(SubscriberTest, ATornSampleIsNeverGivenOut) {
   begin();
   subscriber.set_target(target.data());

@@ -546,6 +546,23 @@ TEST(SamplePump, SendsEachSampleOfAStreamThatIsSlowerThanTheHighestRate) {
   EXPECT_EQ(rig.accepted(), tids(0, 9));
 }
 
+// As many as the network carries.
+TEST(SamplePump, SendsTheNewestEachTimeTheNetworkTakesOneWithAVeryHighRate) {
+  PumpRig rig(kLarge, 64);
+  rig.thinned = true;
+  rig.write(10);
+  rig.start({0, 9, 1e6});
+  EXPECT_EQ(rig.run_on(kStart), PumpWait::sample);
+  rig.peer.room = kLarge / 2;
+  rig.write();
+  EXPECT_EQ(rig.run(kStart + 10ms), PumpWait::output);
+  rig.write(5);
+  rig.peer.room = MemoryPeer::kAll;
+  EXPECT_EQ(rig.run_on(kStart + 30ms), PumpWait::sample);
+  EXPECT_EQ(rig.accepted(), (std::vector<Tid>{9, 10, 15}));
+  EXPECT_EQ(rig.pump->lost(), 0u);
+}
+
 TEST(SamplePump, ReportsNoGapWhenAThinnedStreamLapsIt) {
   PumpRig rig(kLarge, 4);
   rig.thinned = true;
@@ -712,6 +729,50 @@ TEST_F(OverloadedWithAVeryLongHistory, NothingIsSparedForEver) {
   int rounds = 0;
   while (rig.pump->lost() == 0 && rounds < 60) round(++rounds);
   EXPECT_EQ(rounds, 31);
+}
+
+// Of 200 samples a second, on a network that is never faster nor slower.
+class Thinning : public testing::TestWithParam<int> {};
+INSTANTIATE_TEST_SUITE_P(CarriedPerSecond, Thinning, testing::Values(38, 90, 150, 190),
+                         testing::PrintToStringParamName());
+
+TEST_P(Thinning, IsEven) {
+  constexpr int kPeriodMs = 5, kAfterwardsMs = 2000, kMostMs = 60'000;
+  PumpRig rig(kLarge, 16);
+  rig.newest_first = true;
+  SamplePump::Plan plan{0, kNoTid, 0};
+  plan.newest_first = true;
+  rig.start(plan);
+  rig.write();
+  EXPECT_EQ(rig.run_on(), PumpWait::sample);
+  const std::size_t bytes_per_ms =
+      rig.peer.sent.size() * static_cast<std::size_t>(GetParam()) / 1000;
+  rig.peer.room = 0;
+  int known_at = kMostMs;
+  std::size_t sent_before = 0;
+  for (int ms = 1; ms < known_at + kAfterwardsMs; ++ms) {
+    if (ms % kPeriodMs == 0) rig.write();
+    rig.peer.room = std::min(rig.peer.room + bytes_per_ms, 2 * bytes_per_ms);
+    run_turns(rig.loop);  // the rest of the one before
+    rig.run(kStart + std::chrono::milliseconds(ms));
+    if (known_at < kMostMs || rig.pump->lost() == 0) continue;
+    known_at = ms;
+    sent_before = rig.peer.sent.size();
+  }
+  ASSERT_LT(known_at, kMostMs) << "nothing was left out";
+  rig.peer.room = MemoryPeer::kAll;
+  run_turns(rig.loop);
+  EXPECT_TRUE(rig.pump->pump(kStart, true)) << "the rest of the last one";
+  run_turns(rig.loop);
+  const std::vector<Tid> all = rig.accepted();
+  const auto before = static_cast<std::ptrdiff_t>(all.size() * sent_before / rig.peer.sent.size());
+  Tid longest = 0;
+  for (auto tid = all.begin() + before + 2; tid + 1 < all.end(); ++tid) {
+    longest = std::max(longest, tid[1] - tid[0] - 1);
+  }
+  const double mean = 200.0 / GetParam() - 1;
+  EXPECT_LE(static_cast<double>(longest), 2 * mean + 1) << "left out in a row";
+  EXPECT_TRUE(std::is_sorted(all.begin() + before + 2, all.end())) << "nothing old comes later";
 }
 
 TEST_F(NewestFirst, WhatWaitedForAPauseOfTheNetworkIsSentLater) {

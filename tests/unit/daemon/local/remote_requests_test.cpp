@@ -37,9 +37,7 @@ class FakeFleet final : public Fleet {
     asked.push_back("open_reader " + id.str() + (history ? " with history" : ""));
     reader_then = std::move(then);
   }
-  void want_history(const StreamId& id, bool always) override {
-    asked.push_back("want_history " + id.str() + (always ? " always" : ""));
-  }
+  void want_history(const StreamId& id) override { asked.push_back("want_history " + id.str()); }
   void open_writer(const StreamId& id, const CreatePlan* plan, const std::string&,
                    Then<OpenedRing> then) override {
     asked.push_back("open_writer " + id.str() +
@@ -48,9 +46,9 @@ class FakeFleet final : public Fleet {
     writer_then = std::move(then);
   }
   Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role role, OfferedFiles files,
-                                                  const std::string&) override {
+                                                  bool history, const std::string&) override {
     asked.push_back(std::string("adopt ") + (role == Role::writer ? "writer " : "reader ") +
-                    id.str());
+                    id.str() + (history ? " with history" : ""));
     offered_by_creator = files.may_create;
     return owner.adopt_untrusted(id, std::move(files));
   }
@@ -653,7 +651,7 @@ TEST_F(RecoveringRequestsTest, GiveBackWhatBelongsToAnotherHost) {
   const local::Response answer = client->ask(offer);
   EXPECT_TRUE(answer.has_opened()) << answer.failure().message();
   EXPECT_TRUE(client->last_descriptors.empty());
-  EXPECT_EQ(fleet.asked, (Asked{"adopt reader lidar:0@pc2", "want_history lidar:0@pc2 always"}));
+  EXPECT_EQ(fleet.asked, Asked{"adopt reader lidar:0@pc2 with history"});
   ASSERT_EQ(opens.entries().size(), 1u);
   EXPECT_TRUE(opens.entries().begin()->second.any_host) << "as it was opened";
   EXPECT_TRUE(registry.streams().empty()) << "it is none of ours";

@@ -19,12 +19,26 @@ class MirrorsTest : public RemoteStreamTest<Mirror> {
     parts.on_ring_replaced = [this](const Stream& old) { replaced.push_back(&old); };
   }
 
+  // Without the history that others have asked for.
+  std::shared_ptr<Answer> open_without() {
+    auto answer = std::make_shared<Answer>();
+    streams->open(
+        owner->host(), kOdometry, nullptr,
+        [answer](Result<OpenedRing> result) { answer->emplace(std::move(result)); }, {}, false);
+    return answer;
+  }
   std::shared_ptr<Stream> find() {
     Mirror* mirror = streams->find(kOdometry);
     return mirror ? mirror->acquire() : nullptr;
   }
   std::shared_ptr<Stream> wait(const std::shared_ptr<Answer>& answer) {
     return RemoteStreamTest::wait(answer).stream;
+  }
+  // From the next connection on.
+  void send_newest_first() {
+    wire::Greeting greeting = greeting_of("pc2");
+    greeting.features.emplace_back(wire::kFeatureNewestFirst);
+    owner->greet_as(greeting);
   }
   // Answers Open and Subscribe; returns the latter.
   net::Frame serve(Tid first) {
@@ -208,18 +222,9 @@ TEST_F(MirrorsTest, AnswersWithWhatCameWhenTheHistoryTakesLong) {
 
 // Others may want it.
 TEST_F(MirrorsTest, DoesNotLetThoseWaitForHistoryWhoDidNotAskForIt) {
-  wire::Greeting greeting = greeting_of("pc2");
-  greeting.features.emplace_back(wire::kFeatureNewestFirst);
-  owner->greet_as(greeting);
-  const auto open_without = [&] {
-    auto answer = std::make_shared<Answer>();
-    streams->open(
-        owner->host(), kOdometry, nullptr,
-        [answer](Result<OpenedRing> result) { answer->emplace(std::move(result)); }, {}, false);
-    return answer;
-  };
+  send_newest_first();
   const auto recorder = open();
-  streams->find(kOdometry)->want_history(true);
+  streams->find(kOdometry)->want_history();
   serve(10);
   const auto early = open_without();
   EXPECT_FALSE(early->has_value()) << "there is no sample yet";
@@ -237,6 +242,52 @@ TEST_F(MirrorsTest, DoesNotLetThoseWaitForHistoryWhoDidNotAskForIt) {
   EXPECT_FALSE(recorder->has_value()) << "the history is still on its way";
   owner->send_caught_up();
   wait(recorder);
+}
+
+TEST_F(MirrorsTest, AnswersWhenTheSampleIsHereThatWasNewestWhenTheOwnerWasAsked) {
+  send_newest_first();
+  const auto early = open_without();
+  const net::Frame open = owner->receive();
+  owner->send(opened_frame(open, theirs));
+  const net::Frame subscribe = owner->receive();
+  net::Frame subscribed = subscribed_frame(subscribe, theirs.incarnation, 10);
+  subscribed.mutable_subscribed()->set_newest(11);
+  owner->send(subscribed);
+  samples(10, 10);
+  run_until(loop, [&] { return find() && newest(*find()) == 10; });
+  run_turns(loop, 16);
+  EXPECT_FALSE(early->has_value()) << "a newer one is on its way";
+  samples(11, 11);
+  run_until(loop, [&] { return early->has_value(); });
+  EXPECT_EQ(newest(*early->value().value().stream), 11);
+}
+
+TEST_F(MirrorsTest, FetchesHistoryAfterACutOnlyWhileAProgramHoldsItThatWantsItAtOnce) {
+  parts.mirror_linger = 5s;
+  send_newest_first();
+  const auto answer = open();
+  Mirror& mirror = *streams->find(kOdometry);
+  mirror.want_history();
+  EXPECT_FALSE(serve(0).subscribe().from_newest());
+  samples(0, 5);
+  owner->send_caught_up();
+  std::shared_ptr<Stream> held = mirror.with_history(wait(answer));
+  mirror.want_history();  // it is here: as another program's open, which ended
+  const std::shared_ptr<Stream> other = find();
+  const auto is_fetched_after_a_cut = [&](Tid next) {
+    owner->cut();
+    const net::Frame subscribe = serve(next);
+    samples(next, next);
+    owner->send_caught_up();
+    until_state(proto::Mirror::LIVE);
+    return !subscribe.subscribe().from_newest();
+  };
+  EXPECT_TRUE(is_fetched_after_a_cut(6));
+  EXPECT_TRUE(is_fetched_after_a_cut(7)) << "while it holds it";
+  held.reset();
+  EXPECT_FALSE(is_fetched_after_a_cut(8)) << "nobody wants it any more";
+  held = mirror.with_history(other);
+  EXPECT_FALSE(owner->receive().subscribe().from_newest()) << "at once";
 }
 
 TEST_F(MirrorsTest, FailsWithAReasonWhenTheOwnerDoesNotAnswer) {
