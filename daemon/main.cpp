@@ -196,15 +196,17 @@ struct OtherHosts {
         clock(loop, clock_options(config), std::move(page), own_clock, self.host_id, catalog,
               logger),
         resolver(loop),
+        handshakes(loop),
         parts{loop,           resolver,      registry, logger, self, &clock, config.mirror_linger,
               config.mirrors, config.sending},
         mirrors(parts, catalog),
         writers(parts, catalog),
-        peers(loop, resolver, config.peers, self, catalog, logger),
+        peers(loop, resolver, config.peers, self, catalog, logger, &handshakes),
         interfaces(loop, [this] { peers.on_network_changed(); }),
         service(loop, {self, network.addresses(), config.insecure, &clock}, registry, catalog,
                 peers, mirrors, writers) {
     parts.opens = &opens;
+    parts.handshakes = &handshakes;
     parts.on_ring_replaced = [this](const Stream& old) { service.on_ring_replaced(old); };
   }
 
@@ -221,6 +223,7 @@ struct OtherHosts {
   Catalog catalog;
   FleetClock clock;
   Resolver resolver;
+  HandshakeBudget handshakes;
   ChannelParts parts;
   RemoteStreams<Mirror> mirrors;
   RemoteStreams<RemoteWriter> writers;

@@ -55,20 +55,24 @@ PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver,
       dialer_(loop, resolver, std::move(options), *this) {}
 
 PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver, const wire::Address& peer,
-                               const wire::Greeting& self, Observer& observer)
+                               const wire::Greeting& self, HandshakeBudget* handshakes,
+                               Observer& observer)
     : PeerConnection(loop, resolver, std::nullopt,
                      {.addresses = {peer},
                       .self = self,
+                      .handshakes = handshakes,
                       .max_queued_bytes = kMaxOutputBytes,
                       .retries_often = true},
                      observer) {}
 
 PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver, const wire::HostId& id,
                                const std::vector<wire::Address>& addresses,
-                               const wire::Greeting& self, Observer& observer)
+                               const wire::Greeting& self, HandshakeBudget* handshakes,
+                               Observer& observer)
     : PeerConnection(loop, resolver, id,
                      {.addresses = addresses,
                       .self = self,
+                      .handshakes = handshakes,
                       .max_queued_bytes = kMaxOutputBytes,
                       .round_time = kFoundRoundTime,
                       .retries_often = true},

@@ -55,13 +55,14 @@ class PeerConnection final : private Dialer::Observer {
   };
 
   // Starts at once; what is given outlives it. To a configured peer, whichever host that is:
+  //   handshakes  as in Dialer::Options
   PeerConnection(const EventLoop& loop, Resolver& resolver, const wire::Address& peer,
-                 const wire::Greeting& self, Observer& observer);
+                 const wire::Greeting& self, HandshakeBudget* handshakes, Observer& observer);
   // To the host `id`, which is announced at one of `addresses` (numbers, best first, at least
   // one); any other that answers there is refused.
   PeerConnection(const EventLoop& loop, Resolver& resolver, const wire::HostId& id,
                  const std::vector<wire::Address>& addresses, const wire::Greeting& self,
-                 Observer& observer);
+                 HandshakeBudget* handshakes, Observer& observer);
   PeerConnection(const PeerConnection&) = delete;
   PeerConnection& operator=(const PeerConnection&) = delete;
 

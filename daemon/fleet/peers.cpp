@@ -39,10 +39,11 @@ PeerProblem same_host_warning(const Peer& in_use, const Peer& by) {
 }  // namespace
 
 Peers::Peers(const EventLoop& loop, Resolver& resolver, const std::vector<wire::Address>& peers,
-             wire::Greeting self, Catalog& catalog, Logger& logger)
+             wire::Greeting self, Catalog& catalog, Logger& logger, HandshakeBudget* handshakes)
     : loop_(loop),
       resolver_(resolver),
       self_(std::move(self)),
+      handshakes_(handshakes),
       catalog_(catalog),
       logger_(logger),
       startup_is_over_(peers.empty()),
@@ -59,7 +60,8 @@ Peers::~Peers() = default;
 
 std::unique_ptr<PeerConnection> Peers::dial(const wire::Address& configured) {
   PeerConnection::Observer& observer = *this;
-  return std::make_unique<PeerConnection>(loop_, resolver_, configured, self_, observer);
+  return std::make_unique<PeerConnection>(loop_, resolver_, configured, self_, handshakes_,
+                                          observer);
 }
 
 Peer& Peers::peer_of(const PeerConnection& connection) {
@@ -245,7 +247,7 @@ void Peers::reconcile_found_host(std::list<Peer>::iterator peer, const Occupied&
     peer->warning = {};
   } else if (!peer->connection) {
     peer->connection = std::make_unique<PeerConnection>(loop_, resolver_, found.host.id,
-                                                        found.usable, self_, observer);
+                                                        found.usable, self_, handshakes_, observer);
   } else if (!found.usable.empty() && found.usable != before) {
     peer->connection->set_addresses(found.usable);
   }

@@ -65,8 +65,10 @@ class Peers final : public HostFinderObserver, private PeerConnection::Observer 
 
   // self: the greeting, by which this host recognizes itself. What is given by reference outlives
   // it.
+  //   handshakes  as in Dialer::Options
   Peers(const EventLoop& loop, Resolver& resolver, const std::vector<wire::Address>& peers,
-        wire::Greeting self, Catalog& catalog, Logger& logger);
+        wire::Greeting self, Catalog& catalog, Logger& logger,
+        HandshakeBudget* handshakes = nullptr);
   Peers(const Peers&) = delete;
   Peers& operator=(const Peers&) = delete;
   ~Peers();
@@ -141,6 +143,7 @@ class Peers final : public HostFinderObserver, private PeerConnection::Observer 
   const EventLoop& loop_;
   Resolver& resolver_;
   const wire::Greeting self_;
+  HandshakeBudget* const handshakes_;
   Catalog& catalog_;
   RateLimitedLogger logger_;  // how often found hosts change is decided by their announcements
   std::list<Peer> peers_;     // the configured ones first

@@ -200,7 +200,7 @@ void Dialer::on_connected(Attempt& attempt) {
     state_ = State::secure;
     timer_.disable();  // the handshake has its own
     handshake_ = std::make_unique<Handshake>(
-        loop_, credentials, std::move(socket), ticket_,
+        loop_, credentials, std::move(socket), ticket_, *options_.handshakes,
         [this](Result<std::unique_ptr<wire::Transport>> secured) {
           if (!secured) return fail(std::move(secured).error().context(peer_name()));
           greet(*std::move(secured));

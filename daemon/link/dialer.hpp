@@ -52,6 +52,8 @@ class Dialer final : private FrameConnection::Observer {
     // attempts.
     std::vector<wire::Address> addresses;
     wire::Greeting self;  // to send; its credentials are used
+    // Of all dialers; outlives them. nullptr: without credentials only.
+    HandshakeBudget* handshakes = nullptr;
     std::size_t max_queued_bytes = 1U << 20;
     Duration round_time = Duration::max();  // as in ConnectPlan
     // After a useful connection, tries often for a while ("recent" in ConnectPlan). A channel need

@@ -18,23 +18,24 @@
 namespace dssm::daemon {
 
 Handshake::Handshake(const EventLoop& loop, std::shared_ptr<const wire::TlsCredentials> credentials,
-                     UniqueFd socket, wire::TlsTicket& ticket, Then then)
-    : Handshake(loop, std::move(credentials), std::move(socket), &ticket, nullptr, false,
+                     UniqueFd socket, wire::TlsTicket& ticket, HandshakeBudget& budget, Then then)
+    : Handshake(loop, std::move(credentials), std::move(socket), &ticket, budget, false,
                 std::move(then)) {
   writable_.enable();  // the connecting end begins
 }
 
 Handshake::Handshake(const EventLoop& loop, std::shared_ptr<const wire::TlsCredentials> credentials,
                      UniqueFd socket, HandshakeBudget& budget, bool takes_plain, Then then)
-    : Handshake(loop, std::move(credentials), std::move(socket), nullptr, &budget, takes_plain,
+    : Handshake(loop, std::move(credentials), std::move(socket), nullptr, budget, takes_plain,
                 std::move(then)) {}
 
 Handshake::Handshake(const EventLoop& loop, std::shared_ptr<const wire::TlsCredentials> credentials,
-                     UniqueFd socket, wire::TlsTicket* ticket, HandshakeBudget* budget,
+                     UniqueFd socket, wire::TlsTicket* ticket, HandshakeBudget& budget,
                      bool takes_plain, Then then)
     : credentials_(std::move(credentials)),
       ticket_(ticket),
       budget_(budget),
+      accepts_(!ticket),
       takes_plain_(takes_plain),
       then_(std::move(then)),
       socket_(std::move(socket)),
@@ -49,7 +50,7 @@ Handshake::Handshake(const EventLoop& loop, std::shared_ptr<const wire::TlsCrede
 
 void Handshake::on_ready() {
   try {
-    if (!tls_ && budget_) return recognize();
+    if (!tls_ && accepts_) return recognize();
     go_on();
   } catch (const std::bad_alloc&) {
     finish(no_memory_left());
@@ -76,9 +77,9 @@ void Handshake::recognize() {
 }
 
 void Handshake::go_on() {
-  if (budget_ && !budget_->try_take()) return;  // the socket stays ready
+  if (!budget_.try_take()) return;  // the socket stays ready
   if (!tls_) {
-    const auto end = budget_ ? wire::TransportEnd::accepted : wire::TransportEnd::connected;
+    const auto end = accepts_ ? wire::TransportEnd::accepted : wire::TransportEnd::connected;
     tls_.emplace(credentials_, wire::make_transport(std::move(socket_), end), end, ticket_);
   }
   const Result<bool> done = tls_->go_on();

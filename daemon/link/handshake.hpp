@@ -17,9 +17,10 @@
 
 namespace dssm::daemon {
 
-// How many handshakes of the accepting end continue in one turn of the loop: each time may take
-// operations with private keys, 0.1 ms to some ms, and any number of handshakes may be due at once.
-// The others continue in later turns, those first that were ready first. loop outlives it.
+// How many handshakes continue in one turn of the loop: each time may take operations with private
+// keys, 0.1 ms to some ms, and any number of handshakes may be due at once. The others continue in
+// later turns, those first that were ready first. The connecting ends have a budget of their own,
+// so that many who connect do not keep this host from connecting. loop outlives it.
 class HandshakeBudget {
  public:
   static constexpr int kPerTurn = 4;
@@ -48,12 +49,12 @@ class Handshake {
   using Then = std::function<void(Result<std::unique_ptr<wire::Transport>>)>;
 
   // Both start at once; loop outlives them.
+  //   budget  of all of them at this end; outlives the handshake
   // The connecting end.
   //   ticket  of the last connection there; outlives the handshake and the transport
   Handshake(const EventLoop& loop, std::shared_ptr<const wire::TlsCredentials> credentials,
-            UniqueFd socket, wire::TlsTicket& ticket, Then then);
+            UniqueFd socket, wire::TlsTicket& ticket, HandshakeBudget& budget, Then then);
   // The accepting end.
-  //   budget       of all of them; outlives the handshake
   //   takes_plain  connections without TLS are passed on
   Handshake(const EventLoop& loop, std::shared_ptr<const wire::TlsCredentials> credentials,
             UniqueFd socket, HandshakeBudget& budget, bool takes_plain, Then then);
@@ -65,7 +66,7 @@ class Handshake {
 
  private:
   Handshake(const EventLoop& loop, std::shared_ptr<const wire::TlsCredentials> credentials,
-            UniqueFd socket, wire::TlsTicket* ticket, HandshakeBudget* budget, bool takes_plain,
+            UniqueFd socket, wire::TlsTicket* ticket, HandshakeBudget& budget, bool takes_plain,
             Then then);
   void on_ready();
   void recognize();
@@ -74,7 +75,8 @@ class Handshake {
 
   const std::shared_ptr<const wire::TlsCredentials> credentials_;
   wire::TlsTicket* const ticket_;  // of the connecting end
-  HandshakeBudget* const budget_;  // of the accepting end
+  HandshakeBudget& budget_;
+  const bool accepts_;
   const bool takes_plain_;
   const Then then_;
   UniqueFd socket_;  // until the first byte came

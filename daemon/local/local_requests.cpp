@@ -165,12 +165,14 @@ Result<Reply> LocalRequests::offer(const Client& client, const local::Offer& req
   DSSM_TRY(opens_.check_quota(*client));
   // An offer without a host is of this one: it may not know the stream after its restart.
   const bool is_own = id.host.empty() || !is_elsewhere(id);
-  files.may_create = rights_.check(*client, Action::create, id).has_value();
+  const bool creates = rights_.check(*client, Action::create, id).has_value();
+  files.may_create = creates;
   const std::shared_ptr<Stream> stream =
       DSSM_TRY(is_own ? registry_.adopt_untrusted(id, std::move(files))
                       : fleet_->adopt_untrusted(id, role, std::move(files), request.history(),
                                                 client->account()));
-  return record_open({client, stream, role, request.tag(), request.any_host()});
+  return record_open({client, stream, role, request.tag(), request.any_host(),
+                      creates && !is_own && role == Role::writer});
 }
 
 Result<Reply> LocalRequests::open_clock(const local::OpenClock& request,
@@ -305,21 +307,22 @@ void LocalRequests::create_elsewhere(const Client& client, const StreamId& id,
   } else if (!rights_.check(*client, Action::remove, id)) {
     plan.scope = CreatePlan::Scope::create;
   }
-  fleet_->open_writer(
-      id, &plan, client->account(),
-      [this, client, creates, tag = request.tag(),
-       answer = std::move(answer)](Result<OpenedRing> writer) {
-        if (!writer) {
-          Error error = std::move(writer).error();
-          if (!creates && error.code == Errc::not_found) {
-            error.message += "; " + creates.error().message;
-          }
-          return answer(std::move(error));
-        }
-        Result<Reply> reply = opened({client, writer->stream, Role::writer, tag, false});
-        if (reply) reply->response.mutable_opened()->set_created(writer->created);
-        answer(std::move(reply));
-      });
+  fleet_->open_writer(id, &plan, client->account(),
+                      [this, client, creates, tag = request.tag(),
+                       answer = std::move(answer)](Result<OpenedRing> writer) {
+                        if (!writer) {
+                          Error error = std::move(writer).error();
+                          if (!creates && error.code == Errc::not_found) {
+                            error.message += "; " + creates.error().message;
+                          }
+                          return answer(std::move(error));
+                        }
+                        OpenEntry entry{client, writer->stream, Role::writer, tag};
+                        entry.creates = creates.has_value();
+                        Result<Reply> reply = opened(entry);
+                        if (reply) reply->response.mutable_opened()->set_created(writer->created);
+                        answer(std::move(reply));
+                      });
 }
 
 void LocalRequests::open_elsewhere(const Client& client, const StreamId& id,

@@ -25,7 +25,8 @@ void OwnerConnection::connect(const KnownHost& host) {
   owner_ = host.greeting.host_id;
   if (!dialer_) {
     address_ = host.address;
-    dialer_.reset(new Dialer(parts_.loop, parts_.resolver, {{address_}, parts_.self}, *this));
+    dialer_.reset(new Dialer(parts_.loop, parts_.resolver,
+                             {{address_}, parts_.self, parts_.handshakes}, *this));
     return;
   }
   if (address_ != host.address) {

@@ -78,6 +78,7 @@ struct ChannelParts {
   std::function<void(const Stream&)> on_ring_replaced = {};
   // Which programs use the rings, for the owners. nullptr: they are not notified.
   const OpenTable* opens = nullptr;
+  HandshakeBudget* handshakes = nullptr;  // as in Dialer::Options
 };
 
 // The connection of a mirror or a remote writer to the dssmd that owns its stream: follows the host

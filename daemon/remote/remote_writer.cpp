@@ -35,6 +35,11 @@ void RemoteWriter::on_connected(const wire::Greeting& them) {
 
 // Asks for the stream as the first program that waits wants it, or as it was before.
 void RemoteWriter::open_at_owner() {
+  // Those that may not create it must not keep the right of one that closed it. Without any, it is
+  // created as before for as long as samples are left to publish.
+  if (creates_ && parts_.opens && ring_ && !is_unused()) {
+    creates_ = parts_.opens->any_creates(*ring_->stream());
+  }
   std::optional<CreatePlan> plan;
   if (const std::optional<CreatePlan>* wanted = first_pending()) {
     plan = *wanted;

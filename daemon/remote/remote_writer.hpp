@@ -72,8 +72,9 @@ class RemoteWriter final : public RemoteStream,
   void stop_publishing() noexcept;
   void on_drain_timer();
 
-  bool creates_ = false;  // a program has created the stream, not only opened it
-  History history_;       // of the owner's ring
+  // A program that has the ring, or had it last, may have the stream created, not only opened.
+  bool creates_ = false;
+  History history_;  // of the owner's ring
   std::unique_ptr<OutgoingRing> ring_;
   std::shared_ptr<StreamFeed> feed_;
   bool may_tear_ = false;  // the owner has the feature "torn"

@@ -62,6 +62,14 @@ bool OpenTable::is_writing(const Stream& stream, ClientNumber client) const {
   return found != by_stream_.end() && found->second.writing.contains(client);
 }
 
+bool OpenTable::any_creates(const Stream& stream) const {
+  const auto found = by_stream_.find(&stream);
+  if (found == by_stream_.end()) return false;
+  const std::set<OpenNumber>& opens = found->second.opens;
+  return std::any_of(opens.begin(), opens.end(),
+                     [this](OpenNumber number) { return entries_.at(number).creates; });
+}
+
 Result<void> OpenTable::remove(ClientNumber client, OpenNumber number) {
   const auto own = by_client_.find(client);
   if (own == by_client_.end() || own->second.erase(number) == 0) {

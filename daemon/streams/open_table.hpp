@@ -34,6 +34,7 @@ struct OpenEntry {
   Role role = Role::reader;
   std::uint32_t tag = 0;
   bool any_host = false;  // opened by a name without a host
+  bool creates = false;   // for writing, of another host: may have the stream created there
 };
 
 class OpenTable {
@@ -66,6 +67,7 @@ class OpenTable {
 
   Counts counts(const Stream& stream) const;
   bool is_writing(const Stream& stream, ClientNumber client) const;
+  bool any_creates(const Stream& stream) const;
   std::vector<StreamUser> users(const Stream& stream) const;  // in the order of opening
   static StreamUser user(const OpenEntry& entry);             // without the host, which is this one
 

@@ -112,6 +112,8 @@ class ServiceTests:
         """Test."""
         self.container.install(self.debs)
         assert self.states() == ("active", "active"), self.states()
+        # At most 1.4; systemd 252 takes the threshold in tenths.
+        self.container.run("systemd-analyze", "security", "--threshold=14", "dssmd.service")
 
     def crash(self) -> None:
         """Test. Seven in a row, because systemd may stop units that start five times in 10 s."""

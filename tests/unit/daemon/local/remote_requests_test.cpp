@@ -469,6 +469,7 @@ TEST_F(RemoteRightsTest, ReachAsFarAtAnotherHostAsHere) {
     EXPECT_FALSE(fleet.writer_plan->keep_existing) << verbs;
     fleet.writer_then(OpenedRing{fleet.ring("lidar"), false});
     EXPECT_TRUE(client->next().has_opened()) << verbs;
+    EXPECT_EQ(opens.entries().rbegin()->second.creates, scope != Scope::join) << verbs;
   }
 }
 
@@ -673,6 +674,8 @@ TEST_F(RecoveringRequestsTest, GiveBackWithTheRightsOfTheProgram) {
     const local::Response answer = program.ask(offer);
     EXPECT_TRUE(answer.has_opened()) << answer.failure().message();
     EXPECT_EQ(fleet.offered_by_creator, std::string_view(verb) == "create");
+    ASSERT_EQ(opens.entries().size(), 1u);
+    EXPECT_EQ(opens.entries().begin()->second.creates, fleet.offered_by_creator);
     ASSERT_TRUE(fleet.owner.remove({"lidar", 0, ""}));
   }
 }

@@ -428,6 +428,20 @@ TEST_F(RemoteWritersTest, CreatesTheStreamOfAKeptRingOnlyForAProgramThatMayCreat
   EXPECT_TRUE(owner->receive().has_create());
 }
 
+// The right to create it ends with the last program that had it.
+TEST_F(RemoteWritersTest, CreatesTheStreamOnlyWhileAProgramThatMayCreateItHasIt) {
+  OpenTable opens{{8, 8}};
+  parts.opens = &opens;
+  const std::shared_ptr<Stream> ring = opened();
+  const OpenNumber creator = opens.add({client(1), ring, Role::writer, 0, false, true});
+  opens.add({client(2), ring, Role::writer, 0});
+  owner->cut();
+  EXPECT_TRUE(owner->receive().has_create());
+  EXPECT_TRUE(opens.remove(1, creator));
+  owner->cut();
+  EXPECT_TRUE(owner->receive().has_open());
+}
+
 // Somebody opened the stream before the program came back: no sample of either may get lost.
 TEST_F(RemoteWritersTest, PublishesAKeptRingBesideOneThatWasOpenedSince) {
   std::optional<Program> program;

@@ -28,7 +28,9 @@ class SecureServer : public testing::Test {
   struct Guest final : Dialer::Observer {
     Guest(SecureServer& rig, wire::Greeting self)
         : dialer(rig.loop, rig.resolver,
-                 {{wire::Address::parse(rig.network.addresses().front()).value()}, std::move(self)},
+                 {{wire::Address::parse(rig.network.addresses().front()).value()},
+                  std::move(self),
+                  &rig.dials},
                  *this) {}
     void on_up(FrameConnection&, const wire::Greeting& greeting) override { them = greeting; }
     Result<void> on_frame(net::Frame& frame) override {
@@ -99,6 +101,7 @@ class SecureServer : public testing::Test {
           std::vector<wire::Address>{wire::Address::parse("127.0.0.1:0", 0, true).value()}, none,
           logger)
           .value();
+  HandshakeBudget dials{loop};  // of the guests
   std::list<Guest> guests;
 
   void SetUp() override { server.serve(network); }
@@ -282,6 +285,32 @@ TEST_F(SecureServer, LeavesTheLoopToOtherWorkDuringAFloodOfHandshakes) {
   }
 }
 
+// As after a cut, when all connections to another host begin again.
+TEST_F(SecureServer, LeavesTheLoopToOtherWorkWhileManyConnect) {
+  HandshakeBudget budget(loop);
+  std::list<wire::TlsTicket> tickets;
+  std::list<Handshake> handshakes;
+  std::vector<UniqueFd> others;
+  for (int i = 0; i < 30; ++i) {
+    int ends[2];
+    ASSERT_EQ(::socketpair(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0, ends), 0);
+    others.emplace_back(ends[0]);
+    handshakes.emplace_back(loop, own->now, UniqueFd(ends[1]), tickets.emplace_back(), budget,
+                            [](const auto&) {});
+  }
+  const auto begun = [&] {
+    return std::count_if(others.begin(), others.end(), [](const UniqueFd& one) {
+      pollfd ready{one.get(), POLLIN, 0};
+      return ::poll(&ready, 1, 0) == 1;
+    });
+  };
+  for (std::ptrdiff_t before = 0, now = 0; now < std::ssize(others); before = now) {
+    run_turns(loop);
+    now = begun();
+    EXPECT_LE(now - before, HandshakeBudget::kPerTurn);
+  }
+}
+
 // From other PCs.
 TEST_F(SecureServer, TellsAPlainProgramWhatIsMissing) {
   int ends[2];
@@ -316,7 +345,8 @@ TEST_F(SecureServer, EndsAHandshakeThatDoesNotGoOn) {
   bool ended = false;
   const MonoTime begin = loop.now();
   wire::TlsTicket ticket;
-  Handshake handshake(loop, own->now, UniqueFd(ends[1]), ticket,
+  HandshakeBudget budget(loop);
+  Handshake handshake(loop, own->now, UniqueFd(ends[1]), ticket, budget,
                       [&](const Result<std::unique_ptr<wire::Transport>>& result) {
                         ended = true;
                         EXPECT_FALSE(result);
