@@ -458,6 +458,12 @@ void Recorder::want_past(Source& source, bool is_new) const {
   RawReader& reader = source.reader;
   source.from = past_of(source, wanted_from_, before_);
   skip_to(reader, *source.from);
+  // An earlier file has these, if the stream was opened again since.
+  const auto found = recorded_.find(reader.id().str());
+  if (found != recorded_.end() && found->second.first == reader.incarnation() &&
+      found->second.second > reader.cursor()) {
+    reader.seek(found->second.second);
+  }
   const Tid newest = reader.newest_tid();
   source.past_until = newest > reader.cursor() ? newest : kNoTid;
   source.next = is_new ? reader.cursor() + 1 : first_wanted(reader, source.from);
@@ -465,6 +471,7 @@ void Recorder::want_past(Source& source, bool is_new) const {
 
 Result<void> Recorder::end() {
   Result<void> completed = complete();
+  for (const Source& source : sources_) remember(source);
   is_recording_ = false;
   return completed;
 }
@@ -500,6 +507,7 @@ Result<void> Recorder::take_until(Time held_from) {
   if (until) until = saturating_add(*until, kPastPart);
   is_more_ = false;
   DSSM_TRY(take_in_order(until, held_from));
+  check_readers();
   end_sources();
   for (Source& source : sources_) DSSM_TRY(write_properties(source, source.is_over));
   drop_ended();
@@ -643,6 +651,7 @@ void Recorder::follow_restart(Source& source) {
 }
 
 void Recorder::on_restarted(Source& source) {
+  source.is_removed = false;
   source.property.clear();  // dssmd reports the one that it has
   source.is_over = is_duplicate(source);
   if (source.is_over) source.new_properties.clear();  // the other one has them
@@ -668,7 +677,19 @@ void Recorder::end_sources() {
   }
 }
 
+void Recorder::remember(const Source& source) {
+  if (!is_on_demand_ || source.number >= newest_tids_.size()) return;
+  const std::pair now(source.reader.incarnation(), newest_tids_[source.number]);
+  auto& before = recorded_[source.reader.id().str()];
+  if (before.first != now.first || before.second < now.second) before = now;
+}
+
 void Recorder::drop_ended() {
+  for (const Source& source : sources_) {
+    if (!source.is_over) continue;
+    remember(source);
+    if (source.is_removed) recorded_.erase(source.reader.id().str());
+  }
   std::erase_if(sources_, [](const Source& source) { return source.is_over; });
 }
 
@@ -689,14 +710,21 @@ void Recorder::check_readers() {
   next_check_ = now + kCheckPeriod;
   // Their rings would take memory for ever.
   for (const StreamId& removed : opener_.take_removed(keep_removed_)) {
-    std::erase_if(sources_, [&](const Source& one) { return one.reader.id() == removed; });
+    for (Source& source : sources_) source.is_removed |= source.reader.id() == removed;
   }
+  for (Source& source : sources_) source.is_over |= source.is_removed && is_taken(source);
+  if (is_recording_) return;  // take() drops them
   for (Source& source : sources_) {
+    if (source.is_over) continue;
     follow_restart(source);
     forget_properties(source);
   }
   end_sources();
   drop_ended();
+}
+
+bool Recorder::is_taken(const Source& source) const {
+  return !is_recording_ || source.reader.cursor() >= source.reader.newest_tid();
 }
 
 Result<void> Recorder::take_in_order(std::optional<Time> past_until, Time held_from) {

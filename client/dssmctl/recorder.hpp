@@ -114,7 +114,7 @@ class Recorder {
   static constexpr Duration kOpeningTime = std::chrono::seconds(1);
   // Another host that sends nothing more is not waited for longer than that.
   static constexpr Duration kMaxPastWait = std::chrono::seconds(10);
-  static constexpr Duration kCheckPeriod = std::chrono::seconds(1);  // of readers, without a file
+  static constexpr Duration kCheckPeriod = std::chrono::seconds(1);  // of readers
   // The past is recorded in parts of this length, each of all streams, so that the recording is
   // about in the order of times.
   static constexpr Duration kPastPart = std::chrono::milliseconds(100);
@@ -153,6 +153,7 @@ class Recorder {
     std::vector<NewProperty> new_properties;  // the file has not yet
     // Its reader cannot continue, or another source has the ring that it would continue with.
     bool is_over = false;
+    bool is_removed = false;  // the stream; what its ring still has is taken
   };
   static Time past_of(const Source& source, Time now, Duration past);
 
@@ -275,8 +276,10 @@ class Recorder {
   static bool is_of_past(const Source& source) { return source.next <= source.past_until; }
   // The time of the next sample; empty: there is none, or it is not here.
   static std::optional<Time> next_time(const Source& source);
-  // While nothing is recorded: closes what was removed, and follows restarts.
+  // Ends those of removed streams; while nothing is recorded, also follows restarts.
   void check_readers();
+  // Whether its ring has nothing more for the file.
+  bool is_taken(const Source& source) const;
   void follow_restart(Source& source);
   // To be called when the reader has gone to another ring.
   void on_restarted(Source& source);
@@ -285,6 +288,8 @@ class Recorder {
   // Marks those whose readers cannot continue; their streams are opened again.
   void end_sources();
   void drop_ended();
+  // What a file has of it, for the files that follow.
+  void remember(const Source& source);
   static void forget_properties(Source& source);
   void add_property(const StreamId& id, NewProperty property);
   // Those whose time is known.
@@ -300,6 +305,8 @@ class Recorder {
   bool is_recording_;  // in file_, which is not finished
   std::optional<RecordingWriter> file_;
   std::vector<Tid> newest_tids_;  // that file_ has, by the streams' numbers
+  // The newest ring of each stream, and the newest sample of it that a file has.
+  std::map<std::string, std::pair<std::uint64_t, Tid>> recorded_;
   Time wanted_from_{};            // on demand: of the file's samples
   Duration before_{};             // the same, before begin()
   Opener opener_;

@@ -109,6 +109,25 @@ TEST_F(RecorderOf, AStreamThatIsCreatedAgainTwiceMeanwhileHasAllSamples) {
   EXPECT_EQ(recorded_samples(), (std::vector<std::uint64_t>{0, 5, 6}));
 }
 
+TEST_F(RecorderOf, AStreamThatWasRemovedDoesNotKeepItsRing) {
+  RawWriter writer = replace<double>(0);
+  ctl::RecorderPlan plan{ctl::StreamFilter({}, {}), {}, {}, {}, false};
+  plan.keep_removed = {};
+  recorder_ = ctl::Recorder::start(session_with(daemon_), RecordingWriter::create(file_).value(),
+                                   std::move(plan))
+                  .value();
+  await([&] { return recorder_->take() && recorder_->streams() == 1; });
+  const double value = 0;
+  for (int i = 0; i < 5; ++i) writer.write(std::as_bytes(std::span(&value, 1)));
+  ASSERT_TRUE(session_.remove(writer.id()));
+  await([&] { return recorder_->take() && recorder_->streams() == 0; });
+  writer = replace<double>(6);
+  await([&] { return recorder_->take() && recorder_->streams() == 1; });
+  ASSERT_TRUE(recorder_->finish());
+  EXPECT_EQ(recorded_samples(), (std::vector<std::uint64_t>{5, 6}));
+  EXPECT_EQ(recorder_->progress().lost_samples, 0U);
+}
+
 TEST_F(RecorderOf, AStreamThatComesLaterLosesWhatItsRingOverwroteBeforeItWasOpened) {
   RawWriter other = session_.create_raw({"other", 0, ""}, type_of<double>(), depth_of(8)).value();
   start(other.id());
