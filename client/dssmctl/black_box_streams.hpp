@@ -14,6 +14,9 @@
 
 namespace dssm::ctl {
 
+// The name of the program that a black box is for dssmd: others read these streams, too.
+inline constexpr const char* kBlackBoxProgram = "dssmctl record --black-box";
+
 // Who writes a sample there asks for an incident.
 inline constexpr const char* kTriggerStream = "dssm_trigger";
 struct TriggerRequest {

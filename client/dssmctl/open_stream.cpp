@@ -52,10 +52,10 @@ Result<std::optional<OpenedStream>> open_stream(Session& session, const StreamId
 
 }  // namespace
 
-Result<Session> connect(const CommonOptions& options) {
+Result<Session> connect(const CommonOptions& options, std::string program) {
   SessionOptions session_options;
   session_options.socket_path = options.socket_path;
-  session_options.program = "dssmctl " + options.verb_name;
+  session_options.program = program.empty() ? "dssmctl " + options.verb_name : std::move(program);
   Result<Session> session = Session::connect(std::move(session_options));
   const std::string path = socket_path(options);
   struct stat file {};

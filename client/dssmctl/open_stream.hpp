@@ -17,7 +17,8 @@
 
 namespace dssm::ctl {
 
-Result<Session> connect(const CommonOptions& options);
+//   program  what dssmd shows as its name; empty: "dssmctl VERB"
+Result<Session> connect(const CommonOptions& options, std::string program = {});
 
 // Reports on standard error that the verb waits for `wait` at most, and why.
 void print_waiting(const CommonOptions& options, Duration wait, const Error& reason);

@@ -8,6 +8,7 @@
 #include <utility>
 
 #include "client/dssmctl/black_box.hpp"
+#include "client/dssmctl/black_box_streams.hpp"
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/options.hpp"
 #include "client/dssmctl/output.hpp"
@@ -206,7 +207,7 @@ Json recording_json(const std::filesystem::path& file, const Recorder& recorder)
 Result<void> run(const RecordOptions& options, Output& out) {
   if (!options.repair.empty()) return repair(options, out);
   DSSM_TRY(check_output(options));
-  Session session = DSSM_TRY(connect(options));
+  Session session = DSSM_TRY(connect(options, options.black_box ? kBlackBoxProgram : ""));
   RecordingOptions how;
   how.compression = compression_of(options.compression);
   // With the time that samples wait in their rings, at most a second is missing after a kill.

@@ -97,27 +97,29 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
   // It was created again. That is opened at once, and not when its reader has read the ring before
   // and follows: until then this ring may be overwritten, or be replaced, too.
   std::optional<std::uint64_t> replaced_incarnation;
+  bool is_open = false;
   bool is_other_type = false;  // than its reader can continue with
   if (event.kind == StreamEvent::Kind::added && wants(event.stream)) {
     std::erase_if(unused_patterns_, [&](const std::string& pattern) {
       return fits_pattern(event.stream.id, pattern);
     });
     const auto known = known_.find(name);
+    is_open = known != known_.end() && known->second.is_open;
     if (event.property_set) {
       want_property({event.stream, event.property_after, MonoClock::now()});
-    } else if (known != known_.end() && !event.described && event.stream.property_bytes > 0) {
+    } else if (is_open && !event.described && event.stream.property_bytes > 0) {
       // It was created again, or its host is there again. Its reader continues.
       const bool is_new = known->second.incarnation != event.stream.incarnation;
       want_property(
           {event.stream, is_new ? std::optional(kNoTid) : std::nullopt, MonoClock::now()});
     }
     if (known != known_.end()) {
-      auto& [incarnation, type] = known->second;
-      if (incarnation != event.stream.incarnation) {
-        replaced_incarnation = incarnation;
-        is_other_type = !event.stream.type.check_usable_as(type);
-      } else if (type.is_less_described_than(event.stream.type)) {
-        type = event.stream.type;  // the reader continues only with such ones then
+      Known& before = known->second;
+      if (before.incarnation != event.stream.incarnation) {
+        replaced_incarnation = before.incarnation;
+        is_other_type = is_open && !event.stream.type.check_usable_as(before.type);
+      } else if (before.type.is_less_described_than(event.stream.type)) {
+        before.type = event.stream.type;  // the reader continues only with such ones then
       }
     }
   }
@@ -128,14 +130,17 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
   const auto is_same_stream = [&](const Wanted& wanted) {
     return wanted.stream.id == event.stream.id;
   };
-  std::erase_if(removed_, [&](const auto& entry) { return entry.first == event.stream.id; });
+  std::erase_if(removed_, [&](const Removed& removed) { return removed.id == event.stream.id; });
+  std::erase(gone_, event.stream.id);
   if (event.kind == StreamEvent::Kind::removed) {
     described_.erase(name);
     const bool is_opening = std::ranges::any_of(wanted_, [&](const Wanted& wanted) {
       return is_same_stream(wanted) && wanted.is_opening;  // its reader may be there soon
     });
-    if (known_.contains(name) || is_opening) {
-      removed_.emplace_back(event.stream.id, MonoClock::now());
+    const auto known = known_.find(name);
+    if ((known != known_.end() && known->second.is_open) || is_opening) {
+      removed_.push_back({event.stream.id, deadline_in(plan_.keep_removed)});
+      changed_.notify_one();
     }
     untried_ -= static_cast<std::size_t>(
         std::count_if(wanted_.begin(), wanted_.end(), [&](const Wanted& wanted) {
@@ -148,7 +153,7 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
     });
     return;
   }
-  if (!wants(event.stream) || (known_.contains(name) && !replaced_incarnation) ||
+  if (!wants(event.stream) || (is_open && !replaced_incarnation) ||
       std::any_of(wanted_.begin(), wanted_.end(), is_same_stream)) {
     return;
   }
@@ -215,16 +220,42 @@ std::vector<Recorder::Opener::Wanted>::iterator Recorder::Opener::next_wanted() 
   return next;
 }
 
-std::vector<StreamId> Recorder::Opener::take_removed(Duration age) {
+std::vector<StreamId> Recorder::Opener::take_removed() {
   const std::lock_guard lock(mutex_);
-  std::vector<StreamId> old;
-  std::erase_if(removed_, [&](const auto& entry) {
-    if (MonoClock::now() - entry.second < age) return false;
-    old.push_back(entry.first);
-    known_.erase(entry.first.str());
-    return true;
-  });
-  return old;
+  return std::exchange(gone_, {});
+}
+
+// dssmd reports a stream as removed also when its host is lost. While it is, dssmd answers with
+// what it knows itself; soon afterwards the host may not have the stream again yet.
+void Recorder::Opener::check_removed(std::unique_lock<std::mutex>& lock, const Removed& removed) {
+  bool is_missing = false;
+  if (!plan_.on_demand) {
+    lock.unlock();
+    const Result<StreamInfo> now = session_.stream_info(removed.id);
+    is_missing = !now && now.error().code == Errc::not_found;
+    lock.lock();
+  }
+  const auto entry = std::ranges::find_if(
+      removed_, [&](const Removed& one) { return one.id == removed.id && one.due == removed.due; });
+  if (entry == removed_.end()) return;  // it came again meanwhile
+  const bool is_taken = std::ranges::none_of(
+      opened_, [&](const Source& source) { return source.reader.id() == removed.id; });
+  if (is_taken && (plan_.on_demand || (is_missing && removed.is_missing))) {
+    gone_.push_back(removed.id);
+    if (const auto known = known_.find(removed.id.str()); known != known_.end()) {
+      // Its next ring has to be told from this one. A black box, which may run for ever, does
+      // without that.
+      if (plan_.on_demand) {
+        known_.erase(known);
+      } else {
+        known->second.is_open = false;
+      }
+    }
+    removed_.erase(entry);
+    return;
+  }
+  entry->is_missing = is_missing;
+  entry->due = deadline_in(kRetryPeriod);
 }
 
 void Recorder::Opener::reopen(const RawReader& ended, const Error& error) {
@@ -253,16 +284,19 @@ void Recorder::Opener::run() {
   while (true) {
     const auto next = next_wanted();
     const auto property = std::ranges::min_element(set_properties_, {}, &SetProperty::due);
+    const auto removed = std::ranges::min_element(removed_, {}, &Removed::due);
     const bool is_stream = next != wanted_.end();
     const bool is_property =
         property != set_properties_.end() && (!stop_at_ || property->due <= *stop_at_);
+    const bool is_removed = removed != removed_.end() && !stop_at_;
     if (stop_at_ && ((!is_stream && !is_property) || MonoClock::now() >= *stop_at_)) return;
-    if (!is_stream && !is_property) {
+    if (!is_stream && !is_property && !is_removed) {
       changed_.wait(lock);
       continue;
     }
-    const MonoTime due = std::min(is_stream ? next->due : MonoTime::max(),
-                                  is_property ? property->due : MonoTime::max());
+    const MonoTime due = std::min({is_stream ? next->due : MonoTime::max(),
+                                   is_property ? property->due : MonoTime::max(),
+                                   is_removed ? removed->due : MonoTime::max()});
     if (due > MonoClock::now()) {
       changed_.wait_until(lock, due);
       continue;
@@ -271,6 +305,11 @@ void Recorder::Opener::run() {
       const SetProperty wanted_property = std::move(*property);
       set_properties_.erase(property);
       fetch_property(lock, wanted_property);
+      continue;
+    }
+    if (is_removed && removed->due == due) {
+      const Removed checked = *removed;
+      check_removed(lock, checked);
       continue;
     }
     next->is_opening = true;
@@ -345,6 +384,7 @@ Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
       session.open_raw_reader(wanted.stream.id, nullptr, 0,
                               with_history ? FetchHistory::at_once : FetchHistory::when_read));
   Source source{std::move(reader)};
+  source.is_property_known = property.has_value();
   if (property) source.property = *std::move(property);
   const Tid newest = source.reader.newest_tid();
   Tid newest_there = newest;  // at its owner: on a slow network no sample may be here yet
@@ -437,7 +477,9 @@ Result<std::unique_ptr<Recorder>> Recorder::start(Session session,
 Result<void> Recorder::begin(RecordingWriter file, Duration before) {
   file_ = std::move(file);
   is_recording_ = true;
-  newest_tids_.clear();
+  kept_.clear();
+  numbers_.clear();
+  for (Source& source : sources_) source.number = UINT32_MAX;  // also if the file takes not all
   newest_time_ = Time::min();
   wanted_from_ = WallClock::now();
   before_ = before;
@@ -458,6 +500,12 @@ void Recorder::want_past(Source& source, bool is_new) const {
   RawReader& reader = source.reader;
   source.from = past_of(source, wanted_from_, before_);
   skip_to(reader, *source.from);
+  // An earlier file has these, if the stream was opened again since.
+  const auto found = recorded_.find(reader.id().str());
+  if (found != recorded_.end() && found->second.first == reader.incarnation() &&
+      found->second.second > reader.cursor()) {
+    reader.seek(found->second.second);
+  }
   const Tid newest = reader.newest_tid();
   source.past_until = newest > reader.cursor() ? newest : kNoTid;
   source.next = is_new ? reader.cursor() + 1 : first_wanted(reader, source.from);
@@ -465,6 +513,7 @@ void Recorder::want_past(Source& source, bool is_new) const {
 
 Result<void> Recorder::end() {
   Result<void> completed = complete();
+  for (const Source& source : sources_) remember(source);
   is_recording_ = false;
   return completed;
 }
@@ -500,6 +549,7 @@ Result<void> Recorder::take_until(Time held_from) {
   if (until) until = saturating_add(*until, kPastPart);
   is_more_ = false;
   DSSM_TRY(take_in_order(until, held_from));
+  check_readers();
   end_sources();
   for (Source& source : sources_) DSSM_TRY(write_properties(source, source.is_over));
   drop_ended();
@@ -526,8 +576,17 @@ Duration Recorder::next_period() {
 
 Result<void> Recorder::add(Source source) {
   period_ = kMinPeriod;  // how quickly its ring fills is not known yet
-  // The reader of an earlier source may have gone there by itself.
-  if (is_duplicate(source)) return {};
+  // The reader of an earlier source may have gone there by itself, or its stream was removed, and
+  // has come again with what it had.
+  const auto same = std::ranges::find_if(
+      sources_, [&](const Source& earlier) { return have_same_ring(earlier, source); });
+  if (same != sources_.end()) {
+    if (std::exchange(same->is_removed, false) && source.is_property_known) {
+      add_property(source.reader.id(),
+                   {source.reader.incarnation(), {}, std::move(source.property), {}, {}});
+    }
+    return {};
+  }
   Source& added = sources_.emplace_back(std::move(source));
   if (!is_recording_) return {};
   if (is_on_demand_) want_past(added, added.next == 0);
@@ -541,12 +600,23 @@ Result<void> Recorder::add_to_file(Source& source) {
       opener_.described(reader.id(), reader.incarnation()).value_or(reader.type());
   source.number = DSSM_TRY(file_->add_stream(
       {reader.id(), type, reader.depth(), reader.cycle(), reader.incarnation(), source.property}));
+  numbers_[reader.id().str()] = source.number;
   // What is not wanted of it now is not later, either.
-  if (source.number == newest_tids_.size()) newest_tids_.push_back(source.next - 1);
+  if (source.number == kept_.size()) {
+    kept_.push_back({reader.incarnation(), source.next - 1, source.property});
+  }
   // It was recorded before, and could not be read for a while.
-  if (const Tid newest = newest_tids_[source.number]; newest > source.reader.cursor()) {
-    source.reader.seek(newest);
-    source.next = newest + 1;
+  const Kept& kept = kept_[source.number];
+  if (kept.newest > reader.cursor()) {
+    source.reader.seek(kept.newest);
+    source.next = kept.newest + 1;
+  }
+  // It has another property since.
+  if (source.property != kept.property) {
+    std::vector<std::byte> now = std::exchange(source.property, kept.property);
+    if (source.is_property_known) {
+      add_property(reader.id(), {reader.incarnation(), {}, std::move(now), {}, {}});
+    }
   }
   return {};
 }
@@ -609,6 +679,7 @@ Result<void> Recorder::write_properties(Source& source, bool all) {
     }
     if (next.bytes != source.property) {
       DSSM_TRY(file_->set_property(source.number, next.bytes, from));
+      kept_[source.number].property = next.bytes;
       source.property = std::move(next.bytes);
     }
     properties.erase(properties.begin());
@@ -643,15 +714,19 @@ void Recorder::follow_restart(Source& source) {
 }
 
 void Recorder::on_restarted(Source& source) {
+  source.is_removed = false;
   source.property.clear();  // dssmd reports the one that it has
   source.is_over = is_duplicate(source);
   if (source.is_over) source.new_properties.clear();  // the other one has them
 }
 
+bool Recorder::have_same_ring(const Source& a, const Source& b) {
+  return a.reader.id() == b.reader.id() && a.reader.incarnation() == b.reader.incarnation();
+}
+
 bool Recorder::is_duplicate(const Source& source) const {
   return std::ranges::any_of(sources_, [&](const Source& other) {
-    return &other != &source && other.reader.id() == source.reader.id() &&
-           other.reader.incarnation() == source.reader.incarnation();
+    return &other != &source && have_same_ring(other, source);
   });
 }
 
@@ -668,7 +743,20 @@ void Recorder::end_sources() {
   }
 }
 
+void Recorder::remember(const Source& source) {
+  if (!is_on_demand_ || source.number >= kept_.size()) return;
+  const std::pair now(source.reader.incarnation(), kept_[source.number].newest);
+  if (kept_[source.number].incarnation != now.first) return;  // it has left that ring since
+  auto& before = recorded_[source.reader.id().str()];
+  if (before.first != now.first || before.second < now.second) before = now;
+}
+
 void Recorder::drop_ended() {
+  for (const Source& source : sources_) {
+    if (!source.is_over) continue;
+    remember(source);
+    if (source.is_removed) recorded_.erase(source.reader.id().str());
+  }
   std::erase_if(sources_, [](const Source& source) { return source.is_over; });
 }
 
@@ -688,15 +776,22 @@ void Recorder::check_readers() {
   if (now < next_check_) return;
   next_check_ = now + kCheckPeriod;
   // Their rings would take memory for ever.
-  for (const StreamId& removed : opener_.take_removed(keep_removed_)) {
-    std::erase_if(sources_, [&](const Source& one) { return one.reader.id() == removed; });
+  for (const StreamId& removed : opener_.take_removed()) {
+    for (Source& source : sources_) source.is_removed |= source.reader.id() == removed;
   }
+  for (Source& source : sources_) source.is_over |= source.is_removed && is_taken(source);
+  if (is_recording_) return;  // take() drops them
   for (Source& source : sources_) {
+    if (source.is_over) continue;
     follow_restart(source);
     forget_properties(source);
   }
   end_sources();
   drop_ended();
+}
+
+bool Recorder::is_taken(const Source& source) const {
+  return !is_recording_ || source.reader.cursor() >= source.reader.newest_tid();
 }
 
 Result<void> Recorder::take_in_order(std::optional<Time> past_until, Time held_from) {
@@ -775,7 +870,7 @@ Result<void> Recorder::write(Source& source, const SampleInfo& info) {
   source.next = info.tid + 1;
   DSSM_TRY(file_->write(source.number, info, source.reader.clock_error(info),
                         std::span(payload_).first(info.payload_bytes)));
-  newest_tids_[source.number] = info.tid;
+  kept_[source.number].newest = info.tid;
   newest_time_ = std::max(newest_time_, info.time);
   return {};
 }
@@ -802,8 +897,8 @@ bool Recorder::has_past() const {
 
 std::vector<std::string> Recorder::streams_without_fields() const {
   std::vector<std::string> names;
-  for (const Source& source : sources_) {
-    if (!file_->has_fields(source.number)) names.push_back(source.reader.id().str());
+  for (const auto& [name, number] : numbers_) {
+    if (!file_->has_fields(number)) names.push_back(name);
   }
   return names;
 }

@@ -42,7 +42,9 @@ struct RecorderPlan {
   // Nothing is recorded before begin(); until then streams are only kept open, with what their
   // rings hold, also of other hosts.
   bool on_demand = false;
-  // On demand: streams that were removed, or left with their host, stay open for so long.
+  // Streams that were removed stay open for about so long. On demand, also those that left with
+  // their host, and it is not less than what begin() is to have of the past. Otherwise these stay
+  // open, and their readers continue when the host is there again.
   Duration keep_removed = std::chrono::seconds(3);
 };
 
@@ -83,7 +85,8 @@ class Recorder {
   // Whether nothing of it came for so long that another host must be slow or silent.
   bool is_past_late();
 
-  std::size_t streams() const { return sources_.size(); }
+  // That the file has, also those that were removed since.
+  std::size_t streams() const { return numbers_.size(); }
   // The plan's patterns that no stream has fitted; "*" if it has none, and no stream was wanted.
   std::vector<std::string> unused_patterns() const { return opener_.unused_patterns(); }
   // Those of which the file has only bytes: they were not described.
@@ -114,7 +117,7 @@ class Recorder {
   static constexpr Duration kOpeningTime = std::chrono::seconds(1);
   // Another host that sends nothing more is not waited for longer than that.
   static constexpr Duration kMaxPastWait = std::chrono::seconds(10);
-  static constexpr Duration kCheckPeriod = std::chrono::seconds(1);  // of readers, without a file
+  static constexpr Duration kCheckPeriod = std::chrono::seconds(1);  // of readers
   // The past is recorded in parts of this length, each of all streams, so that the recording is
   // about in the order of times.
   static constexpr Duration kPastPart = std::chrono::milliseconds(100);
@@ -150,9 +153,11 @@ class Recorder {
     Tid last_wanted = kNoTid;         // with `until`: of those that there were when it was opened
     bool is_of_now = true;            // its stamps are of this time, and not of one that is played
     std::vector<std::byte> property;  // that the file has, or gets at its beginning
+    bool is_property_known = false;   // its host has answered when it was opened
     std::vector<NewProperty> new_properties;  // the file has not yet
     // Its reader cannot continue, or another source has the ring that it would continue with.
     bool is_over = false;
+    bool is_removed = false;  // the stream; it ends when what its ring still has is taken
   };
   static Time past_of(const Source& source, Time now, Duration past);
 
@@ -169,8 +174,8 @@ class Recorder {
     // Opens nothing more, but those that there were at begin() or that have another type now, for a
     // second at most; waits for that.
     void end();
-    // Streams that were removed for so long; they are opened again if they come again.
-    std::vector<StreamId> take_removed(Duration age);
+    // Streams that were removed, since the last call; they are opened again if they come again.
+    std::vector<StreamId> take_removed();
     // Opens it again, unless that is being done: `ended` cannot continue, because of `error`.
     void reopen(const RawReader& ended, const Error& error);
 
@@ -201,6 +206,13 @@ class Recorder {
     struct Known {
       std::uint64_t incarnation = 0;
       TypeInfo type;
+      bool is_open = true;  // false: it was removed
+    };
+    // A stream that was removed, as dssmd has reported.
+    struct Removed {
+      StreamId id;
+      MonoTime due{};           // when to look whether it still is
+      bool is_missing = false;  // at the last look its host had no such stream
     };
     // A property to be fetched, of a stream as the event describes it.
     struct SetProperty {
@@ -210,6 +222,7 @@ class Recorder {
     };
     void want_property(SetProperty wanted);
     void fetch_property(std::unique_lock<std::mutex>& lock, const SetProperty& wanted);
+    void check_removed(std::unique_lock<std::mutex>& lock, const Removed& removed);
     // The one to try next; the end: none.
     std::vector<Wanted>::iterator next_wanted();
     bool wants(const StreamInfo& stream) const;
@@ -228,8 +241,9 @@ class Recorder {
     bool is_beginning_ = true;  // begin() runs: what comes is there already
     std::vector<std::string> unused_patterns_;
     std::vector<Wanted> wanted_;
-    std::map<std::string, Known> known_;                  // by name
-    std::vector<std::pair<StreamId, MonoTime>> removed_;  // of these, and when
+    std::map<std::string, Known> known_;  // by name; on demand only those that are open
+    std::vector<Removed> removed_;
+    std::vector<StreamId> gone_;  // for take_removed()
     std::size_t untried_ = 0;
     std::vector<Source> opened_;
     std::vector<SetProperty> set_properties_;                   // the last change of each stream
@@ -246,7 +260,6 @@ class Recorder {
 
   Recorder(Session session, std::optional<RecordingWriter> file, const RecorderPlan& plan)
       : is_on_demand_(plan.on_demand),
-        keep_removed_(plan.keep_removed),
         is_recording_(!plan.on_demand),
         file_(std::move(file)),
         opener_(std::move(session), plan) {}
@@ -275,16 +288,21 @@ class Recorder {
   static bool is_of_past(const Source& source) { return source.next <= source.past_until; }
   // The time of the next sample; empty: there is none, or it is not here.
   static std::optional<Time> next_time(const Source& source);
-  // While nothing is recorded: closes what was removed, and follows restarts.
+  // Ends those of removed streams; while nothing is recorded, also follows restarts.
   void check_readers();
+  // Whether its ring has nothing more for the file.
+  bool is_taken(const Source& source) const;
   void follow_restart(Source& source);
   // To be called when the reader has gone to another ring.
   void on_restarted(Source& source);
+  static bool have_same_ring(const Source& a, const Source& b);
   // Whether another source has the same ring.
   bool is_duplicate(const Source& source) const;
   // Marks those whose readers cannot continue; their streams are opened again.
   void end_sources();
   void drop_ended();
+  // What a file has of it, for the files that follow.
+  void remember(const Source& source);
   static void forget_properties(Source& source);
   void add_property(const StreamId& id, NewProperty property);
   // Those whose time is known.
@@ -296,12 +314,22 @@ class Recorder {
   Result<void> complete();
 
   const bool is_on_demand_;
-  const Duration keep_removed_;
   bool is_recording_;  // in file_, which is not finished
   std::optional<RecordingWriter> file_;
-  std::vector<Tid> newest_tids_;  // that file_ has, by the streams' numbers
-  Time wanted_from_{};            // on demand: of the file's samples
-  Duration before_{};             // the same, before begin()
+  // What file_ has of a ring.
+  struct Kept {
+    std::uint64_t incarnation = 0;
+    Tid newest = kNoTid;
+    std::vector<std::byte> property;  // the last one
+  };
+  std::vector<Kept> kept_;                        // by the streams' numbers in file_
+  std::map<std::string, std::uint32_t> numbers_;  // in file_, of each stream's last ring
+  // On demand: the newest ring of each open stream, and the newest sample of it that a file has. A
+  // stream that was removed stays open for longer than the past that a file has of it, so none of
+  // its samples is wanted twice.
+  std::map<std::string, std::pair<std::uint64_t, Tid>> recorded_;
+  Time wanted_from_{};  // on demand: of the file's samples
+  Duration before_{};   // the same, before begin()
   Opener opener_;
   std::vector<Source> sources_;
   std::vector<Turn> turns_;  // in take_in_order(), the earliest next one first

@@ -21,6 +21,17 @@ namespace {
 constexpr Duration kMaxWait = std::chrono::seconds(3);
 constexpr Duration kPollPeriod = std::chrono::milliseconds(20);
 
+// Whether a black box of the stream's host reads it, or its host does not answer.
+bool may_be_read(Session& session, const StreamInfo& stream) {
+  if (stream.state != StreamState::unknown && stream.readers == 0) return false;
+  const Result<StreamInfo> now = session.stream_info(stream.id);
+  if (!now || now->state == StreamState::unknown) return true;
+  return std::ranges::any_of(now->users, [](const StreamUser& user) {
+    return user.role == Role::reader && user.via == StreamVia::local &&
+           user.program == kBlackBoxProgram;
+  });
+}
+
 // Until the sample is in the stream's ring on its host.
 Result<void> request(Session& session, const StreamInfo& stream, const TriggerRequest& request) {
   Writer<TriggerRequest> writer = DSSM_TRY(session.open_writer<TriggerRequest>(stream.id.str()));
@@ -46,12 +57,7 @@ Result<void> run(const TriggerOptions& options, Output& out) {
   Session session = DSSM_TRY(connect(options));
   std::vector<StreamInfo> recorders = DSSM_TRY(session.list_streams());
   std::erase_if(recorders, [&](const StreamInfo& stream) {
-    if (stream.id.name != kTriggerStream) return true;
-    if (stream.readers > 0) return false;
-    if (stream.state != StreamState::unknown) return true;
-    // Its host did not answer in time for the list.
-    const Result<StreamInfo> now = session.stream_info(stream.id);
-    return now && now->state != StreamState::unknown && now->readers == 0;
+    return stream.id.name != kTriggerStream || !may_be_read(session, stream);
   });
   if (recorders.empty()) {
     return Error{Errc::not_found,

@@ -488,6 +488,18 @@ TEST_F(BlackBox, SaysWhatIsWrong) {
   EXPECT_TRUE(contains(config.err, "befor")) << config.err;
 }
 
+// It records the requests, as all streams, and does nothing else with them.
+TEST_F(BlackBox, IsNotAnotherProgramThatReadsRequests) {
+  const auto requests = session_.create<ctl::TriggerRequest>("dssm_trigger", depth_of(8)).value();
+  Running running(argv({"record", "-o", folder_.file("a.mcap")}), environment());
+  await([&] { return session_.stream_info(requests.id()).value().readers == 1; });
+  const Finished none = ctl({"trigger", "a"});
+  EXPECT_EQ(none.exit_status, 1);
+  EXPECT_TRUE(contains(none.err, "no host has a black box that waits for triggers")) << none.err;
+  running.signal(SIGINT);
+  EXPECT_EQ(running.status(), 0);
+}
+
 TEST_F(BlackBox, TakesItsOptionsFromAFile) {
   auto power = session_.create<Power>("power", depth_of(64)).value();
   const auto other = session_.create<Power>("other", depth_of(64)).value();

@@ -364,6 +364,58 @@ TEST_F(Record, KeepsTheQuotaOfItsFolder) {
   EXPECT_EQ(Recording::open(folder_.path()).value().streams()[0].last_tid, 199);
 }
 
+TEST_F(Record, KeepsTheTotalSizeOfItsFiles) {
+  constexpr std::uint64_t kBytes = 100'000;  // of a sample
+  auto blob =
+      session_.create_raw({"blob", 0, ""}, TypeInfo{"", kBytes, 1, {}}, depth_of(256)).value();
+  Running running(
+      argv({"record", "--compression", "none", "--max-total-size", "8000000", "-o", file_}),
+      environment());
+  await_reader(blob.id());
+  const std::vector<std::byte> payload(kBytes);
+  for (int i = 0; i < 200; ++i) blob.write(payload);
+  await([&] { return !std::filesystem::exists(file_); });
+  running.signal(SIGINT);
+  EXPECT_EQ(running.status(), 0);
+  EXPECT_TRUE(contains(running.rest(), ": 200 samples of 1 stream"));
+  std::uintmax_t total = 0;
+  for (const auto& entry : std::filesystem::directory_iterator(folder_.path())) {
+    total += entry.file_size();
+  }
+  EXPECT_LE(total, 8'000'000U);
+  EXPECT_GE(total, 4'000'000U);
+  EXPECT_EQ(Recording::open(folder_.path()).value().streams()[0].last_tid, 199);
+}
+
+TEST_F(Record, BeginsAnotherFileAfterATime) {
+  auto pose = session_.create<RecordedPose>("pose", depth_of(4096)).value();
+  Running running(argv({"record", "--max-file-duration", "100ms", "-o", file_}), environment());
+  await_reader(pose.id());
+  std::int64_t written = 0;
+  await([&] {
+    pose.write({0, 0, written++});
+    const std::filesystem::directory_iterator files(folder_.path());
+    return std::distance(begin(files), end(files)) >= 3;
+  });
+  running.signal(SIGINT);
+  EXPECT_EQ(running.status(), 0);
+  const Recording recording = Recording::open(folder_.path()).value();
+  EXPECT_GE(recording.files().size(), 3U);
+  EXPECT_EQ(recording.streams()[0].samples, static_cast<std::uint64_t>(written));
+}
+
+TEST_F(Record, OfThePastContinuesIfAsked) {
+  auto pose = session_.create<RecordedPose>("pose", depth_of(256)).value();
+  for (int i = 0; i < 10; ++i) pose.write({0, 0, i});
+  Running running(argv({"record", "--past", "1h", "--follow", "-o", file_}), environment());
+  await_recorded(10);
+  for (int i = 10; i < 15; ++i) pose.write({0, 0, i});
+  await_recorded(15);
+  running.signal(SIGINT);
+  EXPECT_EQ(running.status(), 0);
+  EXPECT_TRUE(contains(running.rest(), ": 15 samples of 1 stream"));
+}
+
 TEST_F(Record, NamesWhatItDeletedAlsoWhenItCannotBegin) {
   const std::string old = folder_.file("dssm_2026_11_10-12_00_00.mcap");
   const std::string newer = folder_.file("dssm_2026_11_11-12_00_00.mcap");

@@ -13,13 +13,23 @@
 #include <optional>
 #include <thread>
 
-#include "tests/process/dssmctl/ctl_test.hpp"
+#include "tests/process/dssmctl/fleet_test.hpp"
 #include "tests/support/folder.hpp"
 
 namespace dssm::test {
 namespace {
 
 using namespace std::chrono_literals;
+
+// How many parts of its rings this process, with the recorder and the test's writers, has mapped.
+std::size_t mapped_parts(const StreamId& id) {
+  std::ifstream maps("/proc/self/maps");
+  std::size_t parts = 0;
+  for (std::string line; std::getline(maps, line);) {
+    parts += contains(line, "dssm-ring:" + id.str() + "#");
+  }
+  return parts;
+}
 
 class RecorderOf : public CtlTest {
  protected:
@@ -109,6 +119,33 @@ TEST_F(RecorderOf, AStreamThatIsCreatedAgainTwiceMeanwhileHasAllSamples) {
   EXPECT_EQ(recorded_samples(), (std::vector<std::uint64_t>{0, 5, 6}));
 }
 
+TEST_F(RecorderOf, AStreamThatWasRemovedDoesNotKeepItsRing) {
+  RawWriter writer = replace<double>(0);
+  ctl::RecorderPlan plan{ctl::StreamFilter({}, {}), {}, {}, {}, false};
+  plan.keep_removed = {};
+  recorder_ =
+      ctl::Recorder::start(session_with(daemon_), RecordingWriter::create(file_).value(), plan)
+          .value();
+  await([&] { return recorder_->take() && recorder_->streams() == 1; });
+  const StreamId id = writer.id();
+  {
+    RawWriter removed = std::move(writer);
+    const double value = 0;
+    for (int i = 0; i < 5; ++i) removed.write(std::as_bytes(std::span(&value, 1)));
+    ASSERT_TRUE(session_.remove(id));
+  }
+  EXPECT_GT(mapped_parts(id), 0U);
+  await([&] { return recorder_->take() && mapped_parts(id) == 0; });
+  EXPECT_EQ(recorder_->streams(), 1U) << "that the file has";
+  EXPECT_TRUE(recorder_->streams_without_fields().empty());
+  writer = replace<double>(6);
+  await([&] { return recorder_->take() && recorder_->progress().samples == 11; });
+  ASSERT_TRUE(recorder_->finish());
+  EXPECT_EQ(recorder_->streams(), 1U);
+  EXPECT_EQ(recorded_samples(), (std::vector<std::uint64_t>{5, 6}));
+  EXPECT_EQ(recorder_->progress().lost_samples, 0U);
+}
+
 TEST_F(RecorderOf, AStreamThatComesLaterLosesWhatItsRingOverwroteBeforeItWasOpened) {
   RawWriter other = session_.create_raw({"other", 0, ""}, type_of<double>(), depth_of(8)).value();
   start(other.id());
@@ -163,6 +200,121 @@ TEST_F(RecorderOf, AStreamThatGotANameForItsTypeIsOpenedAgainForAnother) {
   ASSERT_TRUE(recorder_->finish());
   const RecordingProgress progress = recorder_->progress();
   EXPECT_EQ(progress.samples + progress.lost_samples, 1001U);
+}
+
+// A stream of pc2, which is away for longer than `keep_removed`, and then has the same ring.
+class RecorderOfAHostThatReturns : public FleetTest {
+ protected:
+  void start(bool on_demand) {
+    await_streams(1);
+    ctl::RecorderPlan plan{ctl::StreamFilter({}, {}), {}, {}, {}, on_demand};
+    plan.keep_removed = {};
+    std::optional<RecordingWriter> file;
+    if (!on_demand) file = RecordingWriter::create(file_).value();
+    recorder_ = ctl::Recorder::start(session_with(daemon_), std::move(file), plan).value();
+    await([&] { return recorder_->take() && (on_demand ? is_open() : recorder_->streams() == 1); });
+  }
+  bool is_open() const { return mapped_parts(there_.id()) > writers_parts_; }
+  void write(int samples) {
+    for (int i = 0; i < samples; ++i) there_.write(static_cast<double>(written_++));
+  }
+  void await_recorded() {
+    await([&] {
+      return recorder_->take() &&
+             recorder_->progress().samples == static_cast<std::uint64_t>(written_);
+    });
+  }
+  void take_for(Duration time) {
+    const MonoTime end = deadline_in(time);
+    await([&] { return !recorder_->take() || MonoClock::now() >= end; });
+  }
+  void lose_host() {
+    pc2_.kill_hard();
+    await_state("pc2", HostState::down);
+  }
+  void return_host() {
+    pc2_.start();
+    await([&] { return there_.set_property(property_).has_value(); });
+    await_streams(1);
+  }
+  void expect_all_once() {
+    ASSERT_TRUE(recorder_->finish());
+    EXPECT_EQ(recorder_->take_notices(), std::vector<std::string>());
+    EXPECT_EQ(recorder_->progress().lost_samples, 0U);
+    const Recording recording = Recording::open(file_).value();
+    ASSERT_EQ(recording.streams().size(), 1U);
+    auto reader = recording.open_reader<double>("there").value();
+    for (int i = 0; i < written_; ++i) {
+      const auto sample = reader.read_next();
+      ASSERT_TRUE(sample) << i;
+      EXPECT_EQ(sample->value, i);
+    }
+    EXPECT_FALSE(reader.read_next());
+    EXPECT_EQ(reader.property().value(), property_);
+  }
+
+  const std::vector<std::byte> property_{std::byte{7}};
+  Writer<double> there_ = on_pc2_.create<double>("there", depth_of(4096)).value();
+  std::size_t writers_parts_ = mapped_parts(there_.id());
+  int written_ = 0;
+  TestFolder folder_;
+  std::string file_ = folder_.file("a.mcap");
+  std::unique_ptr<ctl::Recorder> recorder_;
+};
+
+TEST_F(RecorderOfAHostThatReturns, KeepsItsStreamsOpenMeanwhile) {
+  start(false);
+  write(10);
+  await_recorded();
+  lose_host();
+  take_for(4s);  // it looks for the stream twice, a second apart, and drops it a second later
+  EXPECT_TRUE(is_open());
+  write(5);
+  return_host();
+  await_recorded();
+  write(5);
+  await_recorded();
+  expect_all_once();
+}
+
+TEST_F(RecorderOfAHostThatReturns, OnDemandGoesOnWhereItWas) {
+  start(true);
+  write(10);
+  ASSERT_TRUE(recorder_->begin(RecordingWriter::create(file_).value(), 1h));
+  await_recorded();
+  lose_host();
+  await([&] { return recorder_->take() && !is_open(); });
+  write(5);
+  return_host();
+  await_recorded();
+  write(5);
+  await_recorded();
+  expect_all_once();
+}
+
+// Its past is taken in parts, so that the ring still has samples when the host is lost and returns.
+TEST_F(RecorderOfAHostThatReturns, OnDemandGoesOnWithARingThatWasNotTakenYet) {
+  start(true);
+  const Time begin = WallClock::now() - 1000s;
+  for (; written_ < 500; ++written_) there_.write(written_, begin + written_ * 1s);
+  await([&] {
+    const Result<StreamInfo> there = session_.stream_info(there_.id());
+    return recorder_->take() && there && there->mirror && there->mirror->newest == written_ - 1;
+  });
+  ASSERT_TRUE(recorder_->begin(RecordingWriter::create(file_).value(), 1h));
+  lose_host();
+  const MonoTime end = deadline_in(1500ms);  // longer than it takes to see that
+  while (MonoClock::now() < end) {
+    ASSERT_TRUE(recorder_->take());
+    std::this_thread::sleep_for(20ms);
+  }
+  ASSERT_LT(recorder_->progress().samples, static_cast<std::uint64_t>(written_));
+  return_host();
+  await_recorded();
+  take_for(1500ms);
+  write(5);
+  await_recorded();
+  expect_all_once();
 }
 
 struct RecordedVolts {
