@@ -120,19 +120,24 @@ Finding check_mirrors(const Facts& facts) {
 Finding check_times(const Facts& facts) {
   std::vector<std::string> reasons;
   for (const StreamInfo& stream : facts.streams) {
-    if (!stream.mirror || stream.mirror->clock.empty()) continue;
-    const bool is_known = std::ranges::any_of(facts.hosts, [&](const HostInfo& host) {
-      return host.name == stream.id.host && !host.clock_reason.empty();
+    if (!stream.mirror || !gets_samples(*stream.mirror) || stream.mirror->clock.empty()) continue;
+    // One that is down, or whose clock is not good, is another finding.
+    const bool is_good = std::ranges::any_of(facts.hosts, [&](const HostInfo& host) {
+      return host.name == stream.id.host && host.state == HostState::up &&
+             host.clock_reason.empty();
     });
-    if (!is_known) reasons.push_back(stream.mirror->clock);
+    if (is_good) reasons.push_back(stream.mirror->clock);
   }
   if (reasons.empty()) {
     return {"times", Status::ok,
             "those of all streams that are read here are as good as their hosts' clocks"};
   }
-  return {"times", Status::fail, "not good here: " + first_of(std::move(reasons)),
-          "reads by time of these streams are refused, unless clock_policy or clock_streams only "
-          "marks them",
+  // clock_streams may say otherwise of some.
+  const bool refuses = facts.daemon.clock_policy == "enforce";
+  return {"times", refuses ? Status::fail : Status::warn,
+          "not good here: " + first_of(std::move(reasons)),
+          refuses ? "reads by time of these streams are refused"
+                  : "reads by time of these streams deliver samples that are marked",
           "dssmctl clock  # on this PC, on the streams' hosts and where their writers run"};
 }
 

@@ -131,7 +131,7 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
     return wanted.stream.id == event.stream.id;
   };
   std::erase_if(removed_, [&](const Removed& removed) { return removed.id == event.stream.id; });
-  std::erase(gone_, event.stream.id);
+  if (event.kind == StreamEvent::Kind::added) std::erase(gone_, event.stream.id);
   if (event.kind == StreamEvent::Kind::removed) {
     described_.erase(name);
     const bool is_opening = std::ranges::any_of(wanted_, [&](const Wanted& wanted) {

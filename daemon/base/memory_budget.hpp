@@ -102,6 +102,14 @@ class MemoryBudget {
   std::uint64_t used() const noexcept { return used_; }
   std::uint64_t limit() const noexcept { return limit_; }
 
+  // From now on it counts in `all`, which outlives it (nullptr: in none), with what is used.
+  void move_to(MemoryBudget* all) noexcept {
+    if (all_ == all) return;
+    if (all_) all_->used_ -= used_;
+    all_ = all;
+    if (all_) all_->used_ += used_;
+  }
+
   // Of all accounts together; 0: there is no such limit.
   std::uint64_t limit_of_all() const noexcept { return all_ ? all_->limit() : 0; }
 
@@ -116,7 +124,7 @@ class MemoryBudget {
   }
   std::uint64_t limit_;
   std::uint64_t used_ = 0;
-  MemoryBudget* const all_ = nullptr;
+  MemoryBudget* all_ = nullptr;
   const std::string account_;
 };
 

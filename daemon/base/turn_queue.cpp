@@ -2,6 +2,7 @@
 #include "daemon/base/turn_queue.hpp"
 
 #include <algorithm>
+#include <new>
 #include <utility>
 
 namespace dssm::daemon {
@@ -24,7 +25,12 @@ void TurnQueue::Turn::wait(Reason reason) {
   const Account& account = reason == Reason::event ? events_ : requests_;
   of_account_ = queue_.waiting_.try_emplace(account).first;
   used_ = std::max(used_, queue_.least_);
-  place_ = of_account_->second.emplace(used_, this);
+  try {
+    place_ = of_account_->second.emplace(used_, this);
+  } catch (const std::bad_alloc&) {
+    if (of_account_->second.empty()) queue_.waiting_.erase(of_account_);  // run() expects one
+    throw;
+  }
   is_waiting_ = true;
   reason_ = reason;
   queue_.next_.enable_in(Duration::zero());

@@ -31,7 +31,8 @@ void HostClockLog::update(const wire::HostId& id, const std::string& name,
 
 bool HostClockLog::is_changed(const wire::HostId& id, bool is_good) const {
   const auto found = hosts_.find(id);
-  return found != hosts_.end() && found->second.logged_bad == is_good;
+  return found != hosts_.end() && found->second.logged_bad == is_good &&
+         (is_good || found->second.was_good);
 }
 
 void HostClockLog::forget(const wire::HostId& id) {

@@ -26,7 +26,7 @@ class HostClockLog {
   // reason: why the times of its samples are not good here; empty: they are.
   void update(const wire::HostId& id, const std::string& name, const std::string& reason,
               MonoTime now);
-  // Whether update() may log that: it is not what was logged last.
+  // Whether update() may log that at once: it is not what was logged last.
   bool is_changed(const wire::HostId& id, bool is_good) const;
   // It is not connected any more, which is logged elsewhere. What was logged as bad is logged when
   // it is good again.
@@ -40,7 +40,7 @@ class HostClockLog {
     RateLimiter pace{4, std::chrono::minutes(1)};
   };
 
-  // Each boot of a host has another id.
+  // So many that are kept although they left.
   static constexpr std::size_t kMaxHosts = 256;
 
   Logger& logger_;

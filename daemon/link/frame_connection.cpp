@@ -78,18 +78,24 @@ void FrameConnection::take_samples(std::size_t payload_bytes, SampleDelegate& de
 // --- receiving
 
 [[gnu::hot]] void FrameConnection::on_readable() {
-  if (!turn_ || !samples_) return receive();
-  if (!turn_->may_begin(TurnQueue::Reason::event)) {
-    awaits_turn_ = true;
-    return readable_.disable();
-  }
-  const TurnQueue::Work work(*turns_);
+  if (!may_receive()) return;
+  std::optional<TurnQueue::Work> work;
+  if (turn_) work.emplace(*turns_);
   receive();
+}
+
+// If not, the turn continues.
+[[gnu::hot]] bool FrameConnection::may_receive() {
+  if (!turn_ || turn_->may_begin(TurnQueue::Reason::event)) return true;
+  awaits_turn_ = true;
+  readable_.disable();
+  return false;
 }
 
 // At once: all that wait get their turn before the loop looks at the sockets again.
 void FrameConnection::take_turn() {
   if (closed_ || !std::exchange(awaits_turn_, false) || input_.paused) return;
+  if (input_.decoder_held) return continue_receiving();
   readable_.enable();
   on_readable();
 }
@@ -130,7 +136,10 @@ void FrameConnection::take_turn() {
 
 // Continues with the bytes that were received before a pause, or that the transport holds.
 void FrameConnection::continue_receiving() {
-  if (closed_ || input_.paused || !decode(0)) return;
+  if (closed_ || input_.paused || !may_receive()) return;
+  std::optional<TurnQueue::Work> work;
+  if (turn_) work.emplace(*turns_);
+  if (!decode(0)) return;
   if (samples_) samples_->on_batch_end();
   if (closed_ || input_.paused) return;
   if (input_.decoder_held || !transport_->has_buffered_input()) return receive_more();

@@ -103,8 +103,8 @@ class FrameConnection final : private wire::FrameDelegate {
   // connection. Before, a sample is an error of the peer.
   void take_samples(std::size_t payload_bytes, SampleDelegate& delegate) noexcept;
 
-  // From now on samples are received only in this client's turns, of which each calls take_turn().
-  // Both outlive the connection's use of them.
+  // From now on all is received only in this client's turns, of which each calls take_turn(): for
+  // those that send samples. Both outlive the connection's use of them.
   void set_turn(TurnQueue::Turn& turn, TurnQueue& turns) noexcept {
     turn_ = &turn;
     turns_ = &turns;
@@ -242,6 +242,7 @@ class FrameConnection final : private wire::FrameDelegate {
   template <class Work>
   void guarded(Work work);
   void on_readable();
+  bool may_receive();
   void receive();
   void on_writable();
   void continue_receiving();

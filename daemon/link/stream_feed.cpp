@@ -2,6 +2,7 @@
 #include "daemon/link/stream_feed.hpp"
 
 #include <algorithm>
+#include <new>
 #include <utility>
 
 #include "core/base/try.hpp"
@@ -71,6 +72,16 @@ void StreamFeed::on_doorbell_removed(int fd) {
   poll_again_ = true;
   if (polling_) return;  // an observer wrote to the stream
   polling_ = true;
+  try {
+    notify();
+  } catch (const std::bad_alloc&) {  // which ends the connection whose work this is
+    polling_ = false;
+    throw;
+  }
+  polling_ = false;
+}
+
+[[gnu::hot]] void StreamFeed::notify() {
   while (std::exchange(poll_again_, false) && !waiting_.empty()) {
     // Disarmed, so that the writer does not ring for samples that are sent in this round anyway.
     arm(false);
@@ -85,7 +96,6 @@ void StreamFeed::on_doorbell_removed(int fd) {
     }
     notifying_.clear();
   }
-  polling_ = false;
 }
 
 }  // namespace dssm::daemon

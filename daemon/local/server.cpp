@@ -298,7 +298,11 @@ void Connection::send(std::string bytes, std::vector<UniqueFd> descriptors) {
   }
   queued_bytes_ += outgoing.bytes.size();
   queued_descriptors_ += outgoing.descriptors.size();
-  output_.push_back(std::move(outgoing));
+  try {
+    output_.push_back(std::move(outgoing));
+  } catch (const std::bad_alloc&) {
+    return close();  // a part of it may be sent
+  }
   if (charge_output() && !watched_) watch_output();
 }
 

@@ -86,7 +86,7 @@ bool Mirror::wants_history() const noexcept {
 }
 
 void Mirror::want_history() {
-  const bool is_live = channel_.reading() == ChannelClient::Reading::live;
+  const bool is_live = channel_.reading() == ChannelClient::Reading::live && !is_ending_;
   if (is_live && with_history_ && ring_->filling_samples() == 0) return;  // it is here
   history_wanted_ = true;
   subscribe_for_history();

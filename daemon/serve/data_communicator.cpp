@@ -74,7 +74,6 @@ DataCommunicator::DataCommunicator(const Parts& parts, PeerPlace place,
       peer_timeout_(EventSource::timer(parts.loop, [this] { check_peer_timeout(); })) {
   link_.set_budget(place_.budget());
   link_.take_requests_only();
-  link_.set_turn(turn_, parts.turns);
   link_.set_pace(place_.pace());
   link_.set_output_timeout(kOutputTimeout);
   greeting_timeout_.enable_in(wire::kHelloTimeout);
@@ -261,7 +260,10 @@ Result<void> DataCommunicator::dispatch(const net::Frame& request) {
     }
     return request.has_open() ? open(request) : create(request);
   }
-  if (channel_) return channel_->serve_untrusted(request);
+  if (channel_) {
+    if (request.has_start_publishing()) link_.set_turn(turn_, parts_.turns);
+    return channel_->serve_untrusted(request);
+  }
   return Error{Errc::protocol,
                "dssmd of host '" + parts_.self.host +
                    "' (" DSSM_VERSION

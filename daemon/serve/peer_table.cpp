@@ -74,6 +74,8 @@ Result<PeerPlace> PeerTable::admit(const std::string& peer, bool encrypted, bool
     account = std::make_unique<PeerAccount>(peer, limits_.max_peer_memory_bytes,
                                             is_configured ? nullptr : &all_);
   }
+  // The name in `peers` may have been looked up, or the key have changed, since the first one came.
+  account->budget.move_to(is_configured ? nullptr : &all_);
   std::optional<MemoryShare> share = account->budget.try_take(bytes_of(encrypted));
   if (share) return PeerPlace(*this, *account, *std::move(share), is_configured);
   Error error{Errc::limit_exceeded,

@@ -4,6 +4,7 @@
 import json
 import pathlib
 import socket
+import statistics
 import struct
 import subprocess
 import threading
@@ -174,8 +175,8 @@ class ServiceTests:
                   f" {delays_ms[-1]:.0f} ms", flush=True)
             assert found["lost_samples"] == 0 and found["seen_samples"] > 500, found
         run("systemctl", "stop", "writer", "other")
-        # Some 60 ms on an idle PC. Of a busy one, the best tells a new design from a busy moment.
-        assert min(delays_ms) < 500, delays_ms
+        # Some 60 ms on an idle PC. Of a busy one, the median tells a new design from a busy moment.
+        assert statistics.median(delays_ms) < 500, delays_ms
 
     def stop(self) -> None:
         """Test."""

@@ -82,6 +82,12 @@ TEST(PeerTable, BoundsTheMemoryOfAllPeersButConfiguredOnes) {
   table.add_limits(limits);
   EXPECT_EQ(limits.back().used, PeerTable::kFullPeers * kPeerBytes);
   EXPECT_EQ(limits.back().limit, PeerTable::kFullPeers * kPeerBytes);
+  EXPECT_EQ(admit("peer 0", true), "") << "its name in `peers` has been looked up";
+  table.add_limits(limits);
+  EXPECT_EQ(limits.back().used, PeerTable::kFullPeers * kPeerBytes - PeerTable::kConnectionBytes);
+  places.pop_back();
+  EXPECT_NE(admit("peer 0"), "") << "it is not in `peers` any more";
+  EXPECT_TRUE(table.is_full());
   table.set_limits({100, 100, kPeerBytes, 80 * kPeerBytes});
   EXPECT_EQ(admit("one more"), "") << "an eighth of the machine's memory";
 }
