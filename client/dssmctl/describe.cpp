@@ -78,6 +78,7 @@ Json mirror_json(const StreamInfo& stream) {
           {"reconnects", mirror.reconnects},
           {"restarts", mirror.restarts},
           {"clock", or_null(mirror.clock)},
+          {"clock_refused", mirror.clock_refused},
           {"error", or_null(mirror.error)}};
 }
 

@@ -119,6 +119,7 @@ Finding check_mirrors(const Facts& facts) {
 // stricter limit is set for them.
 Finding check_times(const Facts& facts) {
   std::vector<std::string> reasons;
+  bool refuses = false;
   for (const StreamInfo& stream : facts.streams) {
     if (!stream.mirror || !gets_samples(*stream.mirror) || stream.mirror->clock.empty()) continue;
     // One that is down, or whose clock is not good, is another finding.
@@ -126,18 +127,18 @@ Finding check_times(const Facts& facts) {
       return host.name == stream.id.host && host.state == HostState::up &&
              host.clock_reason.empty();
     });
-    if (is_good) reasons.push_back(stream.mirror->clock);
+    if (!is_good) continue;
+    reasons.push_back(stream.mirror->clock);
+    refuses |= stream.mirror->clock_refused;
   }
   if (reasons.empty()) {
     return {"times", Status::ok,
             "those of all streams that are read here are as good as their hosts' clocks"};
   }
-  // clock_streams may say otherwise of some.
-  const bool refuses = facts.daemon.clock_policy == "enforce";
   return {"times", refuses ? Status::fail : Status::warn,
           "not good here: " + first_of(std::move(reasons)),
-          refuses ? "reads by time of these streams are refused"
-                  : "reads by time of these streams deliver samples that are marked",
+          refuses ? "reads by time refuse their samples, except where clock_policy is \"mark\""
+                  : "reads by time deliver their samples, marked",
           "dssmctl clock  # on this PC, on the streams' hosts and where their writers run"};
 }
 

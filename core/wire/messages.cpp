@@ -35,6 +35,7 @@ MirrorInfo mirror_info(const proto::Mirror& message) {
           message.received_bytes(),
           message.error(),
           message.clock(),
+          message.clock_refused(),
           message.filling_samples(),
           message.history_wanted(),
           message.recent_samples(),

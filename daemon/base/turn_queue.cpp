@@ -65,7 +65,13 @@ void TurnQueue::call(Turn& turn) {
   turn.take_();
   turn.used_ += used_ - before;
   turn.is_called_ = false;
-  if (turn.is_waiting_) turn.stop(), turn.wait(turn.reason_);  // now by what it has used
+  if (!turn.is_waiting_) return;
+  // Now by what it has used, in the memory that it has: nobody would catch bad_alloc here.
+  turn.used_ = std::max(turn.used_, least_);
+  auto& of_account = turn.of_account_->second;
+  auto place = of_account.extract(turn.place_);
+  place.key() = turn.used_;
+  turn.place_ = of_account.insert(std::move(place));
 }
 
 }  // namespace dssm::daemon

@@ -424,19 +424,23 @@ void FrameConnection::drop_queue() {
 
 void FrameConnection::close_with(const Error& why) {
   if (closed_) return;
-  if (!output_.lost && !output_.mid_frame && flush()) {
-    const std::string encoded = wire::final_failure(why);
-    const iovec part = part_of(std::as_bytes(std::span(encoded)));
-    transmit({&part, 1});
+  try {
+    if (!output_.lost && !output_.mid_frame && flush()) {
+      const std::string encoded = wire::final_failure(why);
+      const iovec part = part_of(std::as_bytes(std::span(encoded)));
+      transmit({&part, 1});
+    }
+  } catch (const std::bad_alloc&) {
+    // Then the other side does not get the reason.
   }
   close(why);
 }
 
-void FrameConnection::close(const Error& why) {
+void FrameConnection::close(Error why) {
   if (closed_) return;
   closed_ = true;
   if (pace_) pace_->forget(this);
-  last_error_ = why;
+  last_error_ = std::move(why);
   readable_.disable();
   writable_.disable();
   next_turn_.disable();

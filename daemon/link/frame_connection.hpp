@@ -261,7 +261,7 @@ class FrameConnection final : private wire::FrameDelegate {
   void enqueue(Outgoing outgoing);
   void lose_output();
   void drop_queue();
-  void close(const Error& why);
+  void close(Error why);
 
   const EventLoop& loop_;
   std::unique_ptr<wire::Transport> transport_;

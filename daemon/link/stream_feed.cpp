@@ -72,16 +72,6 @@ void StreamFeed::on_doorbell_removed(int fd) {
   poll_again_ = true;
   if (polling_) return;  // an observer wrote to the stream
   polling_ = true;
-  try {
-    notify();
-  } catch (const std::bad_alloc&) {  // which ends the connection whose work this is
-    polling_ = false;
-    throw;
-  }
-  polling_ = false;
-}
-
-[[gnu::hot]] void StreamFeed::notify() {
   while (std::exchange(poll_again_, false) && !waiting_.empty()) {
     // Disarmed, so that the writer does not ring for samples that are sent in this round anyway.
     arm(false);
@@ -90,12 +80,18 @@ void StreamFeed::on_doorbell_removed(int fd) {
       const Waiting waiting = std::exchange(notifying_[i], {nullptr, kNoTid});
       if (!waiting.observer) continue;
       // An observer that is notified calls wait() again: only for the others it is worth arming.
-      const bool is_available = newest_untrusted(reader_) > waiting.known;
-      if (is_available || !wait(*waiting.observer, waiting.known))
-        waiting.observer->on_sample_available();
+      bool is_available = newest_untrusted(reader_) > waiting.known;
+      try {
+        is_available = is_available || !wait(*waiting.observer, waiting.known);
+      } catch (const std::bad_alloc&) {
+        is_available =
+            true;  // it finds no memory either, and ends itself, not who wrote the sample
+      }
+      if (is_available) waiting.observer->on_sample_available();
     }
     notifying_.clear();
   }
+  polling_ = false;
 }
 
 }  // namespace dssm::daemon

@@ -63,7 +63,6 @@ class StreamFeed final : private DoorbellObserver {
   void on_doorbell_added(int fd) override;
   void on_doorbell_removed(int fd) override;
   void arm(bool armed) noexcept;
-  void notify();
 
   const EventLoop& loop_;
   std::shared_ptr<Stream> stream_;

@@ -359,6 +359,7 @@ void Mirror::describe(proto::Mirror& out) const {
   out.set_received_bytes(earlier_.received_bytes + (ring_ ? ring_->received_bytes() : 0));
   if (last_error_) out.set_error(last_error_->message);
   out.set_clock(clock_.reason());
+  out.set_clock_refused(!out.clock().empty() && clock_.refuses());
   if (!ring_) return;
   out.set_depth(ring_->stream()->mapping().geometry().depth);
   out.set_newest_time_ns(to_ns(ring_->newest_time()));

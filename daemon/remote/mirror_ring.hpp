@@ -172,6 +172,8 @@ class MirrorClock {
   Result<void> check_opening() const;
   // Why its times are not good; empty: they are.
   std::string reason() const;
+  // Whether reads by time refuse such samples.
+  bool refuses() const { return assessment().policy == ClockPolicy::enforce; }
 
  private:
   Error refusal() const;

@@ -172,7 +172,8 @@ struct MirrorInfo {
   std::uint64_t received_samples = 0;
   std::uint64_t received_bytes = 0;  // of payloads
   std::string error;                 // why it is not live; empty when it is
-  std::string clock;  // why the times of its samples are suspect; empty when they are not
+  std::string clock;           // why the times of its samples are suspect; empty when they are not
+  bool clock_refused = false;  // for that, reads by time refuse them, and do not only mark
   std::uint64_t filling_samples = 0;  // of the part that is not complete; newer ones are here
   bool history_wanted = false;        // that part is being filled, else when a program reads it
   // Of the last 3 s before the newest sample: how many were written, and how many of these are

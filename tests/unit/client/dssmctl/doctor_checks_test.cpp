@@ -510,11 +510,10 @@ TEST(Doctor, FindsStreamsWhoseTimesAreNotGoodThoughTheirHostsClocksAre) {
   stream.mirror->clock = "programs on other PCs write to it";
   EXPECT_FINDING(facts, "times", Status::ok, "");  // nothing has come yet
   stream.mirror->state = MirrorState::live;
+  EXPECT_FINDING(facts, "times", Status::warn, "dssmctl clock");  // they are only marked
+  stream.mirror->clock_refused = true;
   EXPECT_FINDING(facts, "times", Status::fail, "dssmctl clock");
   EXPECT_EQ(finding_of(facts, "times").text, "not good here: programs on other PCs write to it");
-  facts.daemon.clock_policy = "mark";
-  EXPECT_FINDING(facts, "times", Status::warn, "dssmctl clock");
-  facts.daemon.clock_policy = "enforce";
   facts.hosts[1].clock_reason = "2 ms apart";  // which is a finding of its own
   EXPECT_FINDING(facts, "times", Status::ok, "");
   facts.hosts[1].clock_reason.clear();
