@@ -84,7 +84,7 @@ void FrameConnection::take_samples(std::size_t payload_bytes, SampleDelegate& de
   receive();
 }
 
-// If not, the turn continues.
+// If not, take_turn() goes on with it.
 [[gnu::hot]] bool FrameConnection::may_receive() {
   if (!turn_ || turn_->may_begin(TurnQueue::Reason::event)) return true;
   awaits_turn_ = true;

@@ -84,8 +84,8 @@ void StreamFeed::on_doorbell_removed(int fd) {
       try {
         is_available = is_available || !wait(*waiting.observer, waiting.known);
       } catch (const std::bad_alloc&) {
-        is_available =
-            true;  // it finds no memory either, and ends itself, not who wrote the sample
+        // It finds no memory either, and ends itself, not the connection whose work this is.
+        is_available = true;
       }
       if (is_available) waiting.observer->on_sample_available();
     }

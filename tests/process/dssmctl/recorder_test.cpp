@@ -237,6 +237,14 @@ class RecorderOfAHostThatReturns : public FleetTest {
     await([&] { return there_.set_property(property_).has_value(); });
     await_streams(1);
   }
+  void expect_to_go_on_when_host_returns() {
+    write(5);
+    return_host();
+    await_recorded();
+    write(5);
+    await_recorded();
+    expect_all_once();
+  }
   void expect_all_once() {
     ASSERT_TRUE(recorder_->finish());
     EXPECT_EQ(recorder_->take_notices(), std::vector<std::string>());
@@ -269,12 +277,7 @@ TEST_F(RecorderOfAHostThatReturns, KeepsItsStreamsOpenMeanwhile) {
   lose_host();
   take_for(4s);  // it looks for the stream twice, a second apart, and drops it a second later
   EXPECT_TRUE(is_open());
-  write(5);
-  return_host();
-  await_recorded();
-  write(5);
-  await_recorded();
-  expect_all_once();
+  expect_to_go_on_when_host_returns();
 }
 
 TEST_F(RecorderOfAHostThatReturns, OnDemandGoesOnWhereItWas) {
@@ -284,12 +287,7 @@ TEST_F(RecorderOfAHostThatReturns, OnDemandGoesOnWhereItWas) {
   await_recorded();
   lose_host();
   await([&] { return recorder_->take() && !is_open(); });
-  write(5);
-  return_host();
-  await_recorded();
-  write(5);
-  await_recorded();
-  expect_all_once();
+  expect_to_go_on_when_host_returns();
 }
 
 // Its past is taken in parts, so that the ring still has samples when the host is lost and returns.
