@@ -42,8 +42,8 @@ namespace {
 constexpr std::uint64_t kMaxEntries = 1U << 26;  // of a file; some seconds
 constexpr std::uint64_t kMaxSteps = 1U << 20;    // to list the fields of a type
 constexpr int kMaxTypeNesting = 32;
-constexpr int kMaxQualifiers = 64;  // typedefs of typedefs
-constexpr std::size_t kMaxCandidates = 4096;
+constexpr int kMaxQualifiers = 64;            // typedefs of typedefs
+constexpr std::size_t kMaxCandidates = 4096;  // as many again that a program makes streams of
 constexpr std::size_t kMaxLeftOut = 100;
 constexpr std::size_t kMaxShownTypes = 20;
 
@@ -439,6 +439,7 @@ class TypeFinder {
       : type_name_(type_name), payload_bytes_(payload_bytes) {}
 
   bool has_types = false;
+  bool has_more = false;  // candidates than are kept
   std::map<const void*, Candidate> candidates;
 
   void walk(Dwarf_Die& parent, const std::string& scope, int depth) {
@@ -488,23 +489,29 @@ class TypeFinder {
     return full_name;
   }
 
-  Candidate* add(const Dwarf_Die& named, const std::string& name) {
+  void add(const Dwarf_Die& named, const std::string& name, bool is_stream_type = false) {
     std::optional<Dwarf_Die> die = peeled(named);
-    if (!die || ::dwarf_hasattr(&*die, DW_AT_declaration) != 0) return nullptr;
+    if (!die || ::dwarf_hasattr(&*die, DW_AT_declaration) != 0) return;
     const bool is_typedef = die->addr != named.addr;
     // A typedef is another name of a struct or of an array, not of a number.
     const int tag = ::dwarf_tag(&*die);
     if (is_typedef && !is_record(tag) && tag != DW_TAG_array_type && type_name_.empty()) {
-      return nullptr;
+      return;
     }
     has_types = true;
     const bool is_wanted = type_name_.empty()
                                ? size_of(die, steps_) == std::optional(payload_bytes_)
                                : is_named(name, type_name_);
-    if (!is_wanted || candidates.size() >= kMaxCandidates) return nullptr;
-    Candidate& one = candidates.try_emplace(die->addr, Candidate{*die, {}}).first->second;
+    if (!is_wanted) return;
+    const auto [place, is_new] = candidates.try_emplace(die->addr, Candidate{*die, {}});
+    if (is_new && candidates.size() > (is_stream_type ? 2 : 1) * kMaxCandidates) {
+      candidates.erase(place);
+      has_more = true;
+      return;
+    }
+    Candidate& one = place->second;
+    one.is_stream_type |= is_stream_type;
     if (!name.empty()) one.names.insert(is_typedef ? one.names.end() : one.names.begin(), name);
-    return &one;
   }
 
   void add_stream_type(Dwarf_Die& record) {
@@ -513,10 +520,10 @@ class TypeFinder {
       if (std::optional<Dwarf_Die> type = reference(child, DW_AT_type);
           type && type_name_.empty()) {
         std::optional<Dwarf_Die> die = peeled(type);
-        const bool is_number = die && !is_record(::dwarf_tag(&*die));
-        if (Candidate* one = die ? add(*die, is_number ? name_of(*type) : "") : nullptr) {
-          one->is_stream_type = true;
-        }
+        if (!die) return false;
+        // The full name of a struct that is a candidate is known, or comes with its own entry.
+        const bool is_known = is_record(::dwarf_tag(&*die)) && candidates.contains(die->addr);
+        add(*die, is_known ? "" : name_of(*type), true);
       }
       return false;
     });
@@ -661,6 +668,17 @@ Result<std::vector<DebugType>> debug_types_untrusted(const std::string& path,
   if (!finder.has_types) {
     return failed(Errc::invalid_argument,
                   fmt::format("its debug information has no types (-g1){}", kNoTypes));
+  }
+  if (finder.has_more && std::ranges::none_of(finder.candidates, [](const auto& one) {
+        return one.second.is_stream_type;
+      })) {
+    return failed(
+        Errc::conflict,
+        fmt::format("more than {} types in it {}; choose one with --type, and with its "
+                    "namespace",
+                    kMaxCandidates,
+                    type_name.empty() ? fmt::format("have {}", bytes_text(payload_bytes))
+                                      : fmt::format("are named '{}'", escaped(type_name))));
   }
 
   std::vector<DebugType> types;

@@ -32,7 +32,8 @@ struct DebugType {
 // id and debug link, on this PC only.
 //   path   of the file; /proc/PID/exe also works after the program's file was deleted
 //   fails  not_found, no_permission, invalid_argument (not an ELF file, of another architecture,
-//          without debug information or without types in it), protocol (damaged), system
+//          without debug information or without types in it), protocol (damaged), conflict (more
+//          types than it looks at, and none of them a stream's), system
 //   threads  one at a time; changes the environment (DEBUGINFOD_URLS)
 Result<std::vector<DebugType>> debug_types_untrusted(const std::string& path,
                                                      const std::string& type_name,

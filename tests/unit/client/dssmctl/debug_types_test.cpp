@@ -253,6 +253,21 @@ TEST(DebugTypes, AreChosenByTheStreamsNameOrNotAtAll) {
   EXPECT_TRUE(choice("c-dwarf5", stream_of(16), "Wheels"));
 }
 
+TEST(DebugTypes, OfStreamsAreFoundBehindThousandsOfThatSize) {
+  const auto wheels = choice("many-types-and-stream", stream_of(20));
+  ASSERT_TRUE(wheels) << wheels.error().message;
+  EXPECT_EQ(wheels->type.name, "Wheels");
+}
+
+TEST(DebugTypes, AreNotChosenOfMoreThanAreLookedAt) {
+  const auto any = choice("many-types", stream_of(20, "type1000"));
+  ASSERT_FALSE(any);
+  EXPECT_EQ(any.error().code, Errc::conflict);
+  EXPECT_THAT(any.error().message, HasSubstr("more than 4096 types in it have 20 bytes"));
+  EXPECT_THAT(any.error().message, HasSubstr("--type"));
+  EXPECT_TRUE(choice("many-types", stream_of(20), "Wheels"));
+}
+
 TEST(DebugTypes, OfAnotherSizeAreRefused) {
   const auto other = choice("c-dwarf5", stream_of(48), "Spur_Odometry");
   ASSERT_FALSE(other);
