@@ -282,6 +282,8 @@ bool Lockstep::is_waiting(Program& program, bool with_all_threads, bool accept_e
       }
     }
   }
+  // It has closed its streams, and may be about to end, or to open others.
+  if (processes.empty()) return are_all_asleep(program.process, {});
   if (!with_all_threads) return true;
   const auto sleeps = [&](pid_t process) { return are_all_asleep(process, waiting); };
   if (!std::all_of(processes.begin(), processes.end(), sleeps)) return false;

@@ -258,14 +258,18 @@ class Player {
     clock.set_paused(true);
     set_clock(range_.from);
     course_.seek(range_.from);
-    if (!DSSM_TRY(lockstep.await_start())) return {};
-    while (const RecordedSample* const next = course_.peek(false)) {
-      show(next->info.time);
-      if (!DSSM_TRY(lockstep.advance(next->info.time, set_clock))) return {};
-      DSSM_TRY(play(*next, next->info.time));
+    bool goes_on = DSSM_TRY(lockstep.await_start());
+    while (const RecordedSample* const next = goes_on ? course_.peek(false) : nullptr) {
+      const Time time = next->info.time;
+      show(time);
+      rest_ = range_.to - time;
+      goes_on = DSSM_TRY(lockstep.advance(time, set_clock));
+      if (!goes_on) break;
+      DSSM_TRY(play(*next, time));
       course_.taken();
-      if (!DSSM_TRY(lockstep.settle())) return {};
+      goes_on = DSSM_TRY(lockstep.settle());
     }
+    if (!goes_on) return {};
     DSSM_TRY(set_last_properties());
     return lockstep.finish();
   }
@@ -276,9 +280,11 @@ class Player {
       out_.add(json_document(
           {{"file", options_.file}, {"streams", targets_.size()}, {"samples", played_}}));
     } else {
-      out_.add(fmt::format("{}: {} of {} played\n", escaped(options_.file),
-                           counted(played_, "sample", "samples"),
-                           counted(targets_.size(), "stream", "streams")));
+      out_.add(fmt::format(
+          "{}: {} of {} played{}\n", escaped(options_.file), counted(played_, "sample", "samples"),
+          counted(targets_.size(), "stream", "streams"),
+          rest_ > Duration::zero() ? fmt::format("; ended {} before its end", duration_text(rest_))
+                                   : ""));
     }
   }
 
@@ -695,6 +701,7 @@ class Player {
   bool has_run_ = false;    // the timeline, since all that was due was played
   bool shows_now_ = false;  // what a key has changed
   std::uint64_t played_ = 0;
+  Duration rest_{};  // of the recording, that programs in lockstep did not wait for
 };
 
 }  // namespace

@@ -34,10 +34,10 @@ void print(const char* stream, const dssm::Sample<Numbered>& sample) {
 }
 
 // Waits in a read.
-void next() {
+void next(std::int64_t last = kLast) {
   auto fast = session().await_reader<Numbered>("fast").value();
   fast.seek(dssm::kNoTid);
-  for (std::int64_t number = 0; number < kLast;) {
+  for (std::int64_t number = 0; number < last;) {
     (void)fast.wait(std::chrono::milliseconds(1));
     while (const auto sample = fast.read_next()) {
       print("fast", *sample);
@@ -169,7 +169,8 @@ void wait() {
 }  // namespace
 
 int main(int argc, char** argv) {
-  const std::map<std::string, std::function<void()>> ways = {{"next", next},
+  const std::map<std::string, std::function<void()>> ways = {{"next", [] { next(); }},
+                                                             {"next-100", [] { next(100); }},
                                                              {"any", any},
                                                              {"callbacks", callbacks},
                                                              {"hand-over", hand_over},

@@ -101,6 +101,14 @@ TEST_F(Lockstep, InterruptsProgramsAtTheEnd) {
   EXPECT_EQ(text_of(out), "ended\n");
 }
 
+TEST_F(Lockstep, EndsWithItsProgramsAndSaysHowMuchIsLeft) {
+  const std::string text =
+      output({"play", file_, "--lockstep", program("next-100") + " > /dev/null"});
+  EXPECT_TRUE(contains(text, ": 111 samples of 2 streams played; ended 899 ms before its end"))
+      << text;
+  EXPECT_FALSE(contains(output({"play", file_, "--lockstep", program("wait")}), "before its end"));
+}
+
 TEST_F(Lockstep, SaysWhichProgramFailed) {
   const Finished failed =
       ctl({"play", file_, "--lockstep", program("wait"), "--lockstep", "exit 7"});

@@ -574,6 +574,15 @@ TEST_F(Record, EndsInTimeAndShowsNumbersForPrograms) {
   EXPECT_EQ(Json::parse(output({"info", file, "--json"}))["streams"][0]["stream"], pose.id().str());
 }
 
+TEST_F(Record, EndsAtATime) {
+  auto pose = session_.create<RecordedPose>("pose", depth_of(64)).value();
+  const Time until = WallClock::now() + 200ms;
+  const std::string text =
+      output({"record", "--until", std::to_string(to_ns(until) / 1e9), "-o", file_});
+  EXPECT_GE(WallClock::now(), until);
+  EXPECT_TRUE(contains(text, ": 0 samples of 1 stream")) << text;
+}
+
 TEST_F(Record, SaysWhatIsWrong) {
   const Finished folder = ctl({"record", "-o", folder_.file("no/a.mcap")});
   EXPECT_EQ(folder.exit_status, 1);
@@ -1468,6 +1477,20 @@ TEST_F(PlayFleet, FollowsAPlayerAndForgetsOneThatIsGone) {
   killed.status();
   await([&] { return there_.setting() == PlaybackClock::Setting{}; });
   await([&] { return here_.setting() == PlaybackClock::Setting{}; });
+}
+
+TEST_F(RecordFleet, TakesOnlyStreamsOfAHostIfAsked) {
+  auto here = session_.create<RecordedPose>("pose", depth_of(64)).value();
+  auto there = on_pc2_.create<RecordedPose>("pose", depth_of(64)).value();
+  await_streams(1);
+  here.write({0, 0, 1});
+  there.write({0, 0, 2});
+  const std::string file = folder_.file("a.mcap");
+  output({"record", "--past", "1h", "--host", "pc2", "-o", file});
+  const Recording recording = Recording::open(file).value();
+  ASSERT_EQ(recording.streams().size(), 1U);
+  EXPECT_EQ(recording.streams()[0].id.str(), "pose:0@pc2");
+  EXPECT_EQ(recording.streams()[0].samples, 1U);
 }
 
 TEST_F(RecordFleet, CountsThePastOfAnotherHostFromNow) {
