@@ -204,6 +204,10 @@ class Converter {
   // What was made of it when it fails is removed: half of a recording looks like a whole one.
   Result<Converted> run() {
     Result<Converted> done = convert();
+    const auto has_samples = [&](std::size_t stream) { return info(stream).samples > 0; };
+    if (done && done->samples == 0 && std::ranges::any_of(wanted_, has_samples)) {
+      done = Error{Errc::protocol, "no sample of it can be read"};
+    }
     std::error_code ignored;
     for (const fs::path& path : created_) {
       if (!done) fs::remove(path, ignored);
@@ -213,7 +217,14 @@ class Converter {
 
  private:
   Result<Converted> convert() {
-    if (wanted_.empty()) return Error{Errc::not_found, "no stream of the recording fits"};
+    if (wanted_.empty()) {
+      std::vector<std::string> names;
+      for (const RecordedStreamInfo& stream : recording_.streams()) {
+        names.push_back(escaped(stream.id.str()));
+      }
+      return Error{Errc::not_found, fmt::format("no stream of the recording fits; it has {}",
+                                                names.empty() ? "none" : list_text(names, 20))};
+    }
     const fs::path out = options_.out;
     if (out.extension() == ".mcap") return to_mcap();
     if (out.extension() == ".log") {
@@ -316,10 +327,11 @@ class Converter {
 
 Result<void> run(const ConvertOptions& options, Output& out) {
   const Recording recording = DSSM_TRY(open_recording(options.file, options.more_files));
-  const Converted done = DSSM_TRY(Converter(options, recording).run());
+  const Result<Converted> converted = Converter(options, recording).run();
   for (const std::string& warning : recording.warnings()) {
     print_error(fmt::format("dssmctl: convert: {}\n", escaped_message(warning)));
   }
+  const Converted done = DSSM_TRY(converted);
   if (options.json) {
     out.add(json_document({{"files", done.files}, {"samples", done.samples}}));
   } else {

@@ -82,6 +82,13 @@ Result<void> check_replaceable(const StreamInfo& stream, const DescribeOptions& 
   return {};
 }
 
+// `found` for a stream whose own type has no fields: what that says is kept.
+void keep_own(TypeInfo& found, const TypeInfo& own) {
+  if (own.name.empty()) return;
+  found.name = own.name;
+  found.alignment_bytes = own.alignment_bytes;
+}
+
 Result<ProgramType> describe_stream(Session& session, const StreamInfo& stream,
                                     const DescribeOptions& options) {
   DSSM_TRY(check_replaceable(stream, options));
@@ -99,10 +106,7 @@ Result<ProgramType> describe_stream(Session& session, const StreamInfo& stream,
         fmt::format("describe '{}': '{}' has no field that can be described: {}", stream.id.str(),
                     escaped(type.found.full_name), list_text(type.found.left_out))};
   }
-  if (!stream.type.name.empty() && !options.force) {
-    described.name = stream.type.name;
-    described.alignment_bytes = stream.type.alignment_bytes;
-  }
+  if (!options.force) keep_own(described, stream.type);
   DSSM_TRY(session.describe(stream.id, described, options.force));
   return type;
 }
@@ -177,6 +181,24 @@ std::optional<ProgramType> obvious_type_of_programs(Session& session, const Stre
                                    is_named_alike(type->found.type.name, stream->id.name));
   if (!is_obvious || type->found.type.fields.empty()) return std::nullopt;
   return *std::move(type);
+}
+
+std::map<std::string, TypeInfo> obvious_types_of_programs(Session& session,
+                                                          const std::vector<StreamInfo>& streams,
+                                                          Duration at_most) {
+  std::map<std::string, TypeInfo> types;
+  const MonoTime end = deadline_in(at_most);
+  for (const StreamInfo& listed : streams) {
+    if (MonoClock::now() >= end) break;
+    // Lists leave out the fields of many types; the stream may be gone by now.
+    const Result<StreamInfo> stream = session.stream_info(listed.id);
+    if (!stream || !stream->type.fields.empty()) continue;
+    if (std::optional<ProgramType> type = obvious_type_of_programs(session, listed.id)) {
+      keep_own(type->found.type, stream->type);
+      types.emplace(listed.id.str(), std::move(type->found.type));
+    }
+  }
+  return types;
 }
 
 TypeInfo obvious_type(Session& session, const RawReader& reader, std::string_view verb) {

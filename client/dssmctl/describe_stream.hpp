@@ -1,12 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The type of a stream whose programs do not describe it, from the debug information of those
-// programs: for `dssmctl describe`, and for what `echo` and dssm-view show.
+// programs: for `dssmctl describe`, for what `echo` and dssm-view show, and for the files of
+// `record`.
 #pragma once
 
 #include <dssm/session.hpp>
+#include <map>
 #include <optional>
 #include <string>
+#include <vector>
 
 #include "client/dssmctl/debug_types.hpp"
 
@@ -28,6 +31,12 @@ Result<ProgramType> type_of_programs(Session& session, const StreamInfo& stream,
 // type or because it is the T of an SSMApi<T, P>, and only of programs whose files are root's or
 // the user's own.
 std::optional<ProgramType> obvious_type_of_programs(Session& session, const StreamId& id);
+
+// The same for all `streams` that are not described, by StreamId::str(), for so long at most: large
+// programs take a second each.
+std::map<std::string, TypeInfo> obvious_types_of_programs(Session& session,
+                                                          const std::vector<StreamInfo>& streams,
+                                                          Duration at_most);
 
 // The same for a verb that shows samples of the reader's stream, if it is not described. A line on
 // standard error names the type and its program.

@@ -259,7 +259,11 @@ Result<void> run(const InfoOptions& options, Output& out) {
   if (shown || options.watch || !std::filesystem::exists(options.stream, ignored)) return shown;
   // `record -o NAME` makes a file, or fills a folder, that nothing tells from a stream's name.
   const Result<Recording> recording = open_readable(options.stream);
-  if (!recording) return shown;
+  if (!recording) {
+    return Error{shown.error().code,
+                 fmt::format("{}; and '{}' is no recording: {}", shown.error().message,
+                             escaped(options.stream), recording.error().message)};
+  }
   print_recording(*recording, options, out);
   return {};
 }

@@ -458,15 +458,18 @@ void add_record_limits(CLI::App* record, RecordOptions& options) {
 }
 
 void add_black_box(CLI::App* record, RecordOptions& options) {
-  record->add_flag("--black-box", options.black_box,
-                   "record only around triggers: a file for each incident, in the folder of "
-                   "--output");
+  CLI::Option* const black_box =
+      record->add_flag("--black-box", options.black_box,
+                       "record only around triggers: a file for each incident, in the folder of "
+                       "--output");
   add_seconds(record, "--before",
               "so long before a trigger, as far as the rings hold it (default: "
               "30s)",
-              options.before, Range::not_negative);
+              options.before, Range::not_negative)
+      ->needs(black_box);
   add_seconds(record, "--after", "and so long after it (default: 10s)", options.after,
-              Range::not_negative);
+              Range::not_negative)
+      ->needs(black_box);
   record
       ->add_option("--trigger", options.triggers,
                    "what begins an incident, beside `dssmctl trigger`: 'STREAM.FIELD > 3.5', "
@@ -474,9 +477,11 @@ void add_black_box(CLI::App* record, RecordOptions& options) {
       ->type_name("CONDITION")
       ->allow_extra_args(false);
   add_seconds(record, "--min-interval", "the same trigger not again within that (default: 1min)",
-              options.min_interval, Range::not_negative);
+              options.min_interval, Range::not_negative)
+      ->needs(black_box);
   add_seconds(record, "--max-incident", "triggers prolong an incident up to that (default: 5min)",
-              options.max_incident, Range::positive);
+              options.max_incident, Range::positive)
+      ->needs(black_box);
 }
 
 // Each is a file that other options do not fit.
@@ -502,6 +507,8 @@ void check_record(RecordOptions& options) {
           "--until: a time to come, as seconds since 1970 or ISO 8601");
   require(!options.until || options.until->back || options.until->time > WallClock::now(),
           "--until: that time is over; --for takes a duration");
+  require(std::ranges::count(options.patterns, "") == 0,
+          "PATTERN: it is empty, and no stream has an empty name; '*' fits all");
   require(options.repair.empty() || options.patterns.empty(),
           "--repair takes one file, and nothing else");
   require(!options.follow || options.past,
@@ -540,7 +547,9 @@ void add_record(CLI::App& app, Parsed& parsed) {
   record
       ->add_option("-o,--output", options.file,
                    "the file, or a folder for one (default: dssm_DATE-TIME.mcap)")
-      ->type_name("FILE");
+      ->type_name("FILE")
+      ->check(
+          CLI::Validator([](std::string& text) { return text.empty() ? "it is empty" : ""; }, ""));
   add_seconds(record, "--past", "what the rings hold of so long before now, then end", options.past,
               Range::positive);
   record->add_flag("--follow", options.follow, "with --past: and continue until Ctrl-C");
@@ -623,7 +632,8 @@ void add_play(CLI::App& app, Parsed& parsed) {
       "seconds since 1970, or ISO 8601",
       options.from, parse_recorded_moment);
   add_moment(play, "--to", "end at TIME", options.to, parse_recorded_moment);
-  play->add_flag("-p,--start-paused", options.start_paused, "until Space is pressed");
+  CLI::Option* const paused =
+      play->add_flag("-p,--start-paused", options.start_paused, "until Space is pressed");
   CLI::Option* const loop =
       play->add_flag("-l,--loop", options.loop, "again and again, until Ctrl-C");
   play->add_option("--map", options.mappings,
@@ -645,7 +655,8 @@ void add_play(CLI::App& app, Parsed& parsed) {
       ->allow_extra_args(false)
       ->excludes(rate)
       ->excludes(loop)
-      ->excludes(now);
+      ->excludes(now)
+      ->excludes(paused);
 }
 
 void check_convert(ConvertOptions& options) {

@@ -207,6 +207,11 @@ class Player {
 
   // As the timeline runs, until its end or Ctrl-C. Keys and other programs may change it.
   Result<void> play_by(Timeline& timeline) {
+    if (!keyboard_.is_there() && options_.now && options_.start_paused) {
+      return Error{Errc::invalid_argument,
+                   "--start-paused --now: there is no terminal whose keys could let it run, and "
+                   "--now has no playback clock"};
+    }
     if (keyboard_.is_there()) {
       out_.add(kKeys);
       shows_now_ = true;
@@ -217,6 +222,7 @@ class Player {
       const bool is_paused = timeline.is_paused(), backwards = timeline.speed() < 0;
       const Time paused_at = timeline.now();
       if (timeline.has_jumped()) {
+        tell_if_outside(timeline);
         DSSM_TRY(follow_jump(timeline.now(), timeline));
       } else if (is_paused) {
         DSSM_TRY(play_due(paused_at, backwards, timeline));
@@ -412,8 +418,18 @@ class Player {
         DSSM_TRY(remove_other_type(target, *existing, stream.type));
       }
       const History history{std::max(stream.depth, kMinDepth), stream.cycle};
-      target.writer =
-          DSSM_TRY(session_.create_raw(target.id, stream.type, history, {.keep_existing = true}));
+      Result<RawWriter> writer =
+          session_.create_raw(target.id, stream.type, history, {.keep_existing = true});
+      if (!writer && writer.error().code == Errc::type_mismatch) {
+        return Error{Errc::type_mismatch,
+                     fmt::format("'{0}' is here already, with another type than in the recording "
+                                 "({1}, not {2}); `dssmctl rm {0}` removes it, and --map {0}=OTHER "
+                                 "plays into another stream",
+                                 escaped(short_name(target.id)),
+                                 existing ? escaped(existing->type.str()) : "?",
+                                 escaped(stream.type.str()))};
+      }
+      target.writer = DSSM_TRY(std::move(writer));
       target.is_created |= !existing;
     }
     target.opened_for = from;
@@ -544,6 +560,17 @@ class Player {
     const Time start = backwards ? range_.to : range_.from;
     timeline.start(start, rate, paused);
     return set_properties(start);
+  }
+
+  // As a player of SSM does when it begins: what follows is the end, which looks like success.
+  void tell_if_outside(const Timeline& timeline) const {
+    const Time now = timeline.now();
+    if (is_in_range(now)) return;
+    out_.clear_line();
+    print_notice(
+        fmt::format("another program has set the playback clock to {}, where the recording "
+                    "has nothing",
+                    time_text(now, options_.iso)));
   }
 
   // The timeline has stopped or turned, at `now`. What is due until then is played, because other
@@ -722,13 +749,24 @@ Result<void> run(const PlayOptions& options, Output& out) {
   const Session sharing = session;
   Player player(options, std::move(session), recording, range, out);
   const auto play = [&]() -> Result<void> {
+    std::unique_ptr<SharedPlayback> shared;
+    if (clock) {
+      using With = SharedPlayback::With;
+      auto taken = SharedPlayback::take(
+          sharing, *clock, options.this_host ? With::this_host : With::all_hosts, print_notice);
+      if (!taken && taken.error().code == Errc::conflict) {
+        return Error{Errc::conflict, taken.error().message +
+                                         ". To play beside it: several files with one `dssmctl "
+                                         "play`, or --now, which leaves the clock alone"};
+      }
+      shared = DSSM_TRY(std::move(taken));
+    }
     DSSM_TRY(player.prepare());
     catch_stop_signals();
     Result<void> played;
-    std::optional<SharedPlayback> others;
-    if (clock && !options.this_host) others.emplace(sharing, *clock, print_notice);
     if (options.lockstep.empty()) {
-      Timeline timeline(std::move(clock), others ? SharedPlayback::kLead : Duration::zero());
+      Timeline timeline(std::move(clock),
+                        options.this_host ? Duration::zero() : SharedPlayback::kLead);
       played = player.play_by(timeline);
     } else {
       DSSM_TRY(player.check_leftovers());

@@ -9,6 +9,7 @@
 
 #include "client/dssmctl/black_box.hpp"
 #include "client/dssmctl/black_box_streams.hpp"
+#include "client/dssmctl/describe_stream.hpp"
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/options.hpp"
 #include "client/dssmctl/output.hpp"
@@ -23,6 +24,7 @@ namespace {
 
 // By then the streams that there are could have been opened.
 constexpr Duration kFirstNoticeTime = std::chrono::seconds(1);
+constexpr std::size_t kMaxNamed = 20;  // streams in one notice
 
 // A folder is not created: it may be a disk that is not mounted, or a wrong name.
 Result<void> check_folder(const std::filesystem::path& folder) {
@@ -61,6 +63,20 @@ std::filesystem::path file_of(const RecordOptions& options) {
   if (options.file.empty()) return name;
   return is_folder(options.file) ? std::filesystem::path(options.file) / name
                                  : std::filesystem::path(options.file);
+}
+
+// What `echo` shows of streams that are not described, so that a recording has it, too.
+std::map<std::string, TypeInfo> types_of_programs(Session& session, const StreamFilter& filter) {
+  constexpr Duration kMaxTime = std::chrono::seconds(1);
+  std::vector<StreamInfo> streams = session.list_streams().value_or(std::vector<StreamInfo>{});
+  std::erase_if(streams, [&](const StreamInfo& stream) { return !filter.takes(stream.id); });
+  auto types = obvious_types_of_programs(session, streams, kMaxTime);
+  if (types.empty()) return types;
+  std::vector<std::string> names;
+  for (const auto& [name, type] : types) names.push_back(escaped(name));
+  print_notice(fmt::format("with fields from the debug information of their programs: {}",
+                           list_text(names, kMaxNamed)));
+  return types;
 }
 
 // Records until it is to end, and says how it goes: on a terminal in a line that is redrawn.
@@ -127,14 +143,16 @@ class RecordingRun {
     if (std::exchange(has_named_unused_, true)) return;
     const std::vector<std::string> unused = recorder_.unused_patterns();
     if (unused.empty()) return;
-    notice(options_.patterns.empty() ? "no stream fits so far"
-                                     : fmt::format("no stream fits {} so far", list_text(unused)));
+    const std::string of_hosts =
+        options_.hosts.empty() ? "" : fmt::format(" of {}", escaped(list_text(options_.hosts)));
+    notice(options_.patterns.empty()
+               ? fmt::format("no stream{} fits so far", of_hosts)
+               : fmt::format("no stream{} fits {} so far", of_hosts, list_text(unused)));
   }
 
   void report_undescribed() {
     const std::vector<std::string> names = recorder_.streams_without_fields();
     if (names.empty()) return;
-    constexpr std::size_t kMaxNamed = 20;
     notice(
         fmt::format("without descriptions, so only with their bytes: {}; `dssmctl describe "
                     "STREAM` before a recording gives a stream fields",
@@ -166,21 +184,36 @@ class RecordingRun {
   bool has_named_unused_ = false;
 };
 
+// What a disk has damaged stays lost: it is found by reading all, and said.
 Result<void> repair(const RecordOptions& options, Output& out) {
   const RecordingRepair repaired = DSSM_TRY(repair_recording(options.repair));
+  const Recording recording = DSSM_TRY(open_recording(options.repair, {}));
+  std::uint64_t readable = 0;
+  RecordingCursor cursor = recording.cursor();
+  for (RecordedSample sample; cursor.next(sample);) ++readable;
+  const std::vector<std::string> damages = recording.warnings();
+  for (const std::string& damage : damages) print_notice(escaped_message(damage));
   if (options.json) {
     out.add(json_document({{"file", options.repair},
-                           {"was_whole", repaired.was_whole},
+                           {"was_whole", repaired.was_whole && damages.empty()},
                            {"removed_bytes", repaired.removed_bytes},
-                           {"samples", repaired.samples}}));
-    return {};
+                           {"samples", readable}}));
+  } else {
+    const std::string_view whole =
+        damages.empty() ? "the file was whole" : "the file has its end, but parts are damaged";
+    out.add(fmt::format(
+        "{}: {}, {}\n", escaped(options.repair), counted(readable, "sample", "samples"),
+        repaired.was_whole ? whole
+                           : fmt::format("completed, {} of an incomplete record removed",
+                                         bytes_text(repaired.removed_bytes))));
   }
-  out.add(fmt::format(
-      "{}: {}, {}\n", escaped(options.repair), counted(repaired.samples, "sample", "samples"),
-      repaired.was_whole ? "the file was whole"
-                         : fmt::format("completed, {} of an incomplete record removed",
-                                       bytes_text(repaired.removed_bytes))));
-  return {};
+  if (damages.empty()) return {};
+  return Error{Errc::protocol,
+               fmt::format("'{}' is damaged: {} of its samples cannot be read, and nothing brings "
+                           "them back; `dssmctl convert {} OTHER.mcap` makes a recording of the "
+                           "others",
+                           escaped(options.repair), std::max(repaired.samples, readable) - readable,
+                           escaped(options.repair))};
 }
 
 }  // namespace
@@ -218,6 +251,8 @@ Result<void> run(const RecordOptions& options, Output& out) {
                     {},
                     options.black_box};
   plan.keep_removed = std::max(plan.keep_removed, options.before);
+  // The past is overwritten meanwhile.
+  if (!options.past) plan.types_of_programs = types_of_programs(session, plan.filter);
   if (options.black_box) return run_black_box(options, std::move(session), plan, how, out);
 
   const std::filesystem::path file = file_of(options);

@@ -46,6 +46,8 @@ struct RecorderPlan {
   // their host, and it is not less than what begin() is to have of the past. Otherwise these stay
   // open, and their readers continue when the host is there again.
   Duration keep_removed = std::chrono::seconds(3);
+  // Of streams that are not described, by StreamId::str(): what their programs say of them.
+  std::map<std::string, TypeInfo> types_of_programs = {};
 };
 
 class Recorder {
@@ -261,6 +263,7 @@ class Recorder {
   Recorder(Session session, std::optional<RecordingWriter> file, const RecorderPlan& plan)
       : is_on_demand_(plan.on_demand),
         is_recording_(!plan.on_demand),
+        types_of_programs_(plan.types_of_programs),
         file_(std::move(file)),
         opener_(std::move(session), plan) {}
 
@@ -315,6 +318,7 @@ class Recorder {
 
   const bool is_on_demand_;
   bool is_recording_;  // in file_, which is not finished
+  const std::map<std::string, TypeInfo> types_of_programs_;
   std::optional<RecordingWriter> file_;
   // What file_ has of a ring.
   struct Kept {

@@ -8,6 +8,7 @@
 #include <random>
 
 #include "client/dssmctl/text.hpp"
+#include "core/base/try.hpp"
 
 namespace dssm::ctl {
 namespace {
@@ -29,12 +30,23 @@ Time time_from_seconds(double seconds) {
 
 }  // namespace
 
-SharedPlayback::SharedPlayback(Session session, PlaybackClock clock,
+Result<std::unique_ptr<SharedPlayback>> SharedPlayback::take(
+    Session session, PlaybackClock clock, With with,
+    std::function<void(const std::string&)> on_failure) {
+  const std::uint64_t driver = std::random_device()() | 1U;
+  DSSM_TRY(session.hold_playback_clock(driver));
+  return std::unique_ptr<SharedPlayback>(new SharedPlayback(std::move(session), std::move(clock),
+                                                            with, driver, std::move(on_failure)));
+}
+
+SharedPlayback::SharedPlayback(Session session, PlaybackClock clock, With with,
+                               std::uint64_t driver,
                                std::function<void(const std::string&)> on_failure)
     : session_(std::move(session)),
       clock_(std::move(clock)),
+      with_(with),
       on_failure_(std::move(on_failure)),
-      driver_(std::random_device()() | 1U),
+      driver_(driver),
       thread_([this] { run(); }) {}
 
 SharedPlayback::~SharedPlayback() {
@@ -56,7 +68,6 @@ void SharedPlayback::run() {
 }
 
 void SharedPlayback::share(bool ends) {
-  const auto followers = session_.share_playback_clock(driver_, ends);
   const auto report = [&](const std::string& host, const Error& error) {
     if (ends || !reported_.insert(host).second) return;
     const std::string reason = escaped_message(error.message);
@@ -64,6 +75,13 @@ void SharedPlayback::share(bool ends) {
                              : fmt::format("the playback clock of '{}' does not follow: {}",
                                            escaped(host), reason));
   };
+  if (with_ == With::this_host) {
+    if (Result<void> held = session_.hold_playback_clock(driver_, ends); !held) {
+      report({}, held.error());
+    }
+    return;
+  }
+  const auto followers = session_.share_playback_clock(driver_, ends);
   if (!followers) return report({}, followers.error());
   for (const PlaybackFollower& follower : *followers) {
     if (follower.error) report(follower.host, *follower.error);

@@ -10,6 +10,7 @@
 #include <dssm/session.hpp>
 #include <dssm/time.hpp>
 #include <functional>
+#include <memory>
 #include <optional>
 #include <set>
 #include <string>
@@ -20,16 +21,19 @@ namespace dssm::ctl {
 // As PlaybackClock takes times.
 inline double seconds_of(Time time) { return static_cast<double>(to_ns(time)) / 1e9; }
 
-// Has the playback clocks of all other hosts follow this PC's, in a thread of its own: a host that
-// does not answer delays nothing.
+// Keeps other players away from this PC's playback clock, and has those of all other hosts follow
+// it if asked, in a thread of its own: a host that does not answer delays nothing.
 class SharedPlayback {
  public:
+  enum class With { this_host, all_hosts };
   // A change that shall come at the same moment on all hosts is made so long before.
   static constexpr Duration kLead = std::chrono::milliseconds(50);
 
   // on_failure: gets a sentence for each host that does not follow, once, from the thread
-  SharedPlayback(Session session, PlaybackClock clock,
-                 std::function<void(const std::string&)> on_failure);
+  //   fails  conflict (another player has it), no_permission, unavailable
+  static Result<std::unique_ptr<SharedPlayback>> take(
+      Session session, PlaybackClock clock, With with,
+      std::function<void(const std::string&)> on_failure);
   SharedPlayback(const SharedPlayback&) = delete;
   SharedPlayback& operator=(const SharedPlayback&) = delete;
   ~SharedPlayback();  // the clocks of the other hosts show the real time again
@@ -38,11 +42,14 @@ class SharedPlayback {
   // A change that another program makes is found within this time.
   static constexpr Duration kCheckPeriod = std::chrono::milliseconds(5);
   static constexpr Duration kRenewPeriod = std::chrono::seconds(1);
+  SharedPlayback(Session session, PlaybackClock clock, With with, std::uint64_t driver,
+                 std::function<void(const std::string&)> on_failure);
   void run();
   void share(bool ends);
 
   Session session_;
   PlaybackClock clock_;
+  const With with_;
   const std::function<void(const std::string&)> on_failure_;
   const std::uint64_t driver_;
   std::set<std::string> reported_;  // hosts

@@ -135,12 +135,23 @@ bool TriggerRule::holds_for(double value) const {
 // --- what fires
 
 bool TriggerEvaluator::has_rule_on(const StreamId& stream) const {
-  return std::any_of(rules_.begin(), rules_.end(), [&](const TriggerRule& rule) {
-    if (rule.kind != Kind::field) return false;
+  return !rules_without(stream, {}).empty();
+}
+
+std::vector<std::string> TriggerEvaluator::rules_without(const StreamId& stream,
+                                                         const std::vector<Check>& checks) const {
+  std::vector<std::string> names;
+  for (std::size_t i = 0; i < rules_.size(); ++i) {
+    const TriggerRule& rule = rules_[i];
+    if (rule.kind != Kind::field || std::ranges::count(checks, i, &Check::rule) > 0) continue;
+    if (!checks.empty() && rule.target.find_first_of("*?[") != rule.target.npos) continue;
     const auto parts = splits_at_dots(rule.target);
-    return std::any_of(parts.begin(), parts.end(),
-                       [&](const auto& part) { return is_about(part.first, stream); });
-  });
+    if (std::ranges::any_of(parts,
+                            [&](const auto& part) { return is_about(part.first, stream); })) {
+      names.push_back(rule.name);
+    }
+  }
+  return names;
 }
 
 std::vector<TriggerEvaluator::Check> TriggerEvaluator::checks_of(
@@ -386,6 +397,23 @@ void TriggerWatch::check_lists() {
   }
 }
 
+void TriggerWatch::tell_unfit_rules(const StreamId& stream, const std::vector<Field>& fields,
+                                    const std::vector<TriggerEvaluator::Check>& checks) {
+  const std::vector<std::string> rules = evaluator_.rules_without(stream, checks);
+  if (rules.empty()) return;
+  constexpr std::size_t kMaxNamed = 20;
+  std::vector<std::string> names;
+  for (const Field& field : fields) names.push_back(escaped(field.name));
+  std::vector<std::string> quoted;
+  for (const std::string& rule : rules) quoted.push_back(fmt::format("'{}'", escaped(rule)));
+  const std::string name = escaped(stream.str());
+  notice(fmt::format(
+      "no trigger {} on '{}': {}", list_text(quoted), name,
+      fields.empty()
+          ? fmt::format("it is not described; `dssmctl describe '{}'` gives it fields", name)
+          : fmt::format("it has no such field; there are {}", list_text(names, kMaxNamed))));
+}
+
 void TriggerWatch::subscribe_fields(const std::vector<StreamInfo>& streams) {
   std::set<std::pair<std::string, std::uint64_t>> listed;
   for (const StreamInfo& stream : streams) {
@@ -401,12 +429,10 @@ void TriggerWatch::subscribe_fields(const std::vector<StreamInfo>& streams) {
       type = info->type;
     }
     watch.retry_at = deadline_in(kRetryPeriod);
-    std::vector<TriggerEvaluator::Check> checks =
-        evaluator_.checks_of(stream.id, readable_fields_untrusted(type));
-    if (checks.empty()) {
-      notice(fmt::format("no trigger on '{}': it has no such field", escaped(stream.id.str())));
-      continue;
-    }
+    const std::vector<Field> fields = readable_fields_untrusted(type);
+    std::vector<TriggerEvaluator::Check> checks = evaluator_.checks_of(stream.id, fields);
+    tell_unfit_rules(stream.id, fields, checks);
+    if (checks.empty()) continue;
     SubscribeOptions options;
     options.on_error = [this, name = stream.id.str()](const Error& error) {
       notice(fmt::format("no trigger on '{}': {}", escaped(name), escaped_message(error.message)));

@@ -78,6 +78,10 @@ class TriggerEvaluator {
   // Those of a stream; without `fields` its type is not described.
   std::vector<Check> checks_of(const StreamId& stream, const std::vector<Field>& fields) const;
   bool has_rule_on(const StreamId& stream) const;  // on a field, if it has that
+  // The names of rules that are about the stream and that none of its `checks` is for. Those for
+  // any stream (with a wildcard) only if there are no checks at all.
+  std::vector<std::string> rules_without(const StreamId& stream,
+                                         const std::vector<Check>& checks) const;
 
   void on_sample(const StreamId& stream, const SampleInfo& info, std::span<const std::byte> payload,
                  std::vector<Check>& checks);
@@ -133,6 +137,8 @@ class TriggerWatch {
   void run();
   void subscribe_requests();
   void check_lists();
+  void tell_unfit_rules(const StreamId& stream, const std::vector<Field>& fields,
+                        const std::vector<TriggerEvaluator::Check>& checks);
   void subscribe_fields(const std::vector<StreamInfo>& streams);
   void notice(const std::string& text);
 

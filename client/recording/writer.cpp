@@ -51,6 +51,10 @@ RecordingOptions completed(RecordingOptions options) {
   if (options.max_total_bytes > 0 && options.max_file_bytes == 0) {
     options.max_file_bytes = std::max<std::uint64_t>(options.max_total_bytes / 8, 1);
   }
+  if (options.max_file_bytes > 0) {  // a file may become longer by one chunk
+    const std::uint64_t most = std::max<std::uint64_t>(options.max_file_bytes / 8, 1);
+    options.chunk_bytes = std::min(options.chunk_bytes, most);
+  }
   return options;
 }
 

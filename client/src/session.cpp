@@ -333,6 +333,15 @@ Result<std::vector<PlaybackFollower>> Session::share_playback_clock(std::uint64_
   return followers;
 }
 
+Result<void> Session::hold_playback_clock(std::uint64_t driver, bool ends) {
+  local::Request request;
+  request.mutable_follow_playback()->set_driver(driver);
+  request.mutable_follow_playback()->set_ends(ends);
+  request.mutable_follow_playback()->set_this_host(true);
+  DSSM_TRY(ask(*client_, std::move(request), "take the playback clock"));
+  return {};
+}
+
 Result<RoundTrip> Session::ping(const std::string& host) {
   local::Request request;
   request.mutable_ping_host()->set_host(host);

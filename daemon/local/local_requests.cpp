@@ -390,6 +390,11 @@ void LocalRequests::follow_playback(const Client& client, const proto::FollowPla
   Result<proto::FollowPlayback> lead = clock_.lead(
       request, fmt::format("{}@{}", client->program, registry_.host()), MonoClock::now());
   if (!lead) return answer(std::move(lead).error());
+  if (request.this_host()) {
+    Reply reply;
+    reply.response.mutable_playback_followers();
+    return answer(std::move(reply));
+  }
   fleet_->follow_playback(*lead,
                           [answer = std::move(answer)](Result<proto::PlaybackFollowers> followers) {
                             if (!followers) return answer(std::move(followers).error());
@@ -419,9 +424,9 @@ void LocalRequests::ping(const std::string& host, Answer answer) {
 Reply LocalRequests::record_open(const OpenEntry& entry) {
   Reply reply;
   proto::Opened& message = *reply.response.mutable_opened();
-  message.set_handle(opens_.add(entry));
   wire::to_message(entry.stream->id(), *message.mutable_stream()->mutable_id());
   wire::to_message(entry.stream->type(), *message.mutable_stream()->mutable_type());
+  message.set_handle(opens_.add(entry));  // last: nothing is recorded when memory is short
   return reply;
 }
 

@@ -411,6 +411,10 @@ class Session {
   //   fails    conflict (this PC's clock follows another driver), no_permission
   Result<std::vector<PlaybackFollower>> share_playback_clock(std::uint64_t driver,
                                                              bool ends = false);
+  // The same for this PC's clock alone: for 5 s no other driver is accepted, of this PC or of
+  // another one.
+  //   fails    as share_playback_clock()
+  Result<void> hold_playback_clock(std::uint64_t driver, bool ends = false);
   // The processes connected to dssmd.
   Result<std::vector<ClientInfo>> list_clients();
   // All streams that processes have open.

@@ -216,12 +216,25 @@ TEST_F(BlackBox, IsTriggeredByAFieldOverItsLimit) {
   EXPECT_EQ(Recording::open(file).value().triggers().front().time, time);
 }
 
+TEST_F(BlackBox, NamesATriggerWhoseFieldIsNotThere) {
+  auto power = session_.create<Power>("power", depth_of(4096)).value();
+  Running running(
+      recorder({"--trigger", "power.volts < 21.5", "--trigger", "hot: power.celsius > 90"}),
+      environment());
+  const std::string line = running.line();
+  EXPECT_TRUE(contains(line,
+                       "no trigger 'hot' on 'power:0@pc1': it has no such field; there are "
+                       "volts, "))
+      << line;
+}
+
 TEST_F(BlackBox, IsTriggeredByAFieldThatIsDescribedLater) {
   const TypeInfo unnamed{"", sizeof(Power), alignof(Power), {}};
   RawWriter power = session_.create_raw({"power", 0, ""}, unnamed, depth_of(4096)).value();
   Running running(recorder({"--after", "100ms", "--trigger", "low: power.volts < 21.5"}),
                   environment());
-  EXPECT_TRUE(contains(running.line(), "no trigger on 'power:0@pc1': it has no such field"));
+  EXPECT_TRUE(contains(
+      running.line(), "no trigger 'low' on 'power:0@pc1': it is not described; `dssmctl describe"));
   ASSERT_TRUE(session_.describe(power.id(), type_of<Power>()));
   await([&] { return session_.stream_info(power.id()).value().readers == 2; });
   const Power low{21.25, 0};

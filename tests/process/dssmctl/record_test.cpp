@@ -491,6 +491,13 @@ TEST_F(Record, InfoTakesNamesOfRecordingsInTheWorkingDirectory) {
   EXPECT_TRUE(contains(info("bare").out, "owner:")) << "a stream comes first";
 }
 
+TEST_F(Record, InfoSaysWhyAFolderIsNoRecording) {
+  std::ofstream(folder_.file("foreign.mcap")) << "abc";
+  const Finished finished = ctl({"info", folder_.path()});
+  EXPECT_EQ(finished.exit_status, 1);
+  EXPECT_TRUE(contains(finished.err, "foreign.mcap")) << finished.err;
+}
+
 TEST_F(Record, InfoFailsWhenNothingCanBeRead) {
   for (const char* content : {"", "\x89MCAP"}) {
     std::ofstream(file_, std::ios::trunc) << content;
@@ -703,6 +710,66 @@ TEST_F(Play, SaysThatAPartIsDamaged) {
   std::ofstream(file_) << content;
   const Finished played = ctl({"play", file_});
   EXPECT_TRUE(contains(played.err, "'" + file_ + "'")) << played.err << played.out;
+  const Finished repaired = ctl({"record", "--repair", file_});
+  EXPECT_EQ(repaired.exit_status, 1) << repaired.out;
+  EXPECT_TRUE(contains(repaired.out, ": 0 samples, the file has its end, but parts are damaged"))
+      << repaired.out;
+  EXPECT_TRUE(contains(repaired.err, "100 of its samples cannot be read")) << repaired.err;
+  const std::string other = folder_.file("other.mcap");
+  const Finished converted = ctl({"convert", file_, other});
+  EXPECT_EQ(converted.exit_status, 1) << converted.out;
+  EXPECT_TRUE(contains(converted.err, "no sample of it can be read")) << converted.err;
+  EXPECT_FALSE(std::filesystem::exists(other));
+}
+
+TEST_F(Play, SaysThatAStreamIsHereWithAnotherType) {
+  make_recording();
+  (void)session_.create<double>("pose", depth_of(4)).value();
+  const Finished played = ctl({"play", file_});
+  EXPECT_EQ(played.exit_status, 1);
+  EXPECT_TRUE(contains(played.err, "`dssmctl rm pose` removes it, and --map pose=OTHER"))
+      << played.err;
+}
+
+// It would change the clock under the first one, and both would end early.
+TEST_F(Play, RefusesAClockThatAnotherPlayerHas) {
+  make_recording();
+  for (const std::vector<std::string>& where : {std::vector<std::string>{}, {"--this-host"}}) {
+    std::vector<std::string> first = {"play", file_, "--rate", "0.001"},
+                             second = {"play", file_, "--map", "pose=copy"};
+    first.insert(first.end(), where.begin(), where.end());
+    second.insert(second.end(), where.begin(), where.end());
+    Running running(argv(first), environment());
+    auto clock = session_.open_playback_clock().value();
+    await([&] { return clock.setting().speed == 0.001; });
+    const Finished refused = ctl(second);
+    EXPECT_EQ(refused.exit_status, 1) << refused.out;
+    EXPECT_TRUE(contains(refused.err, "its playback clock follows 'dssmctl play@pc1'"))
+        << refused.err;
+    EXPECT_FALSE(session_.stream_info({"copy", 0, ""}));
+    EXPECT_EQ(clock.setting().speed, 0.001);
+    running.signal(SIGINT);
+    EXPECT_EQ(running.status(), 0);
+  }
+}
+
+TEST_F(Play, SaysThatTheClockWasSetToAnotherTime) {
+  make_recording();
+  Running running(argv({"play", file_, "--rate", "0.001"}), environment());
+  auto clock = session_.open_playback_clock().value();
+  await([&] { return clock.setting().speed == 0.001; });
+  clock.set_time(5000);
+  while (!contains(running.line(), "another program has set the playback clock to 5000.")) {
+  }
+  EXPECT_EQ(running.status(), 0);
+}
+
+// A key would let it run, and there is no terminal.
+TEST_F(Play, DoesNotWaitForKeysThatCannotCome) {
+  make_recording();
+  const Finished refused = ctl({"play", file_, "--now", "--start-paused"});
+  EXPECT_EQ(refused.exit_status, 2);
+  EXPECT_TRUE(contains(refused.err, "there is no terminal")) << refused.err;
 }
 
 TEST_F(Play, SetsThePropertyOfTheTimeAtWhichItIs) {

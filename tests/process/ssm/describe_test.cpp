@@ -98,7 +98,7 @@ TEST_F(Describe, GivesTheStreamOfAProgramNamesThatStay) {
   EXPECT_THAT(again.err, Not(HasSubstr("theta"))) << "one line, whatever the type has";
 }
 
-TEST_F(Describe, EchoShowsTheFieldsOfAProgramThatRuns) {
+TEST_F(Describe, EchoAndRecordTakeTheFieldsOfAProgramThatRuns) {
   start_program("old_logger-debug");
   const Finished echo = ctl({"echo", "--last", "spur_odometry:3"});
   ASSERT_EQ(echo.exit_status, 0) << echo.err;
@@ -108,6 +108,12 @@ TEST_F(Describe, EchoShowsTheFieldsOfAProgramThatRuns) {
   const Finished plot = ctl({"plot", "spur_odometry:3.theta", "--for", "10ms"});
   EXPECT_EQ(plot.exit_status, 0) << plot.err;
   EXPECT_THAT(plot.out, HasSubstr(" 0.25\n"));
+  const std::string file = folder + "/odometry.mcap";
+  const Finished record = ctl({"record", "--for", "10ms", "-o", file});
+  EXPECT_EQ(record.exit_status, 0) << record.err;
+  EXPECT_THAT(record.err, HasSubstr("from the debug information of their programs: "
+                                    "spur_odometry:3@pc1\n"));
+  EXPECT_THAT(ctl({"info", "--json", file}).out, HasSubstr("theta"));
   EXPECT_TRUE(session.stream_info(kStream)->type.fields.empty()) << "they change nothing";
 }
 

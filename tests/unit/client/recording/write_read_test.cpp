@@ -281,6 +281,20 @@ TEST_F(RecordingFiles, SplitsBySizeAndOpensTheFolderAsOne) {
   EXPECT_EQ(Recording::open(folder_).error().code, Errc::conflict);
 }
 
+TEST_F(RecordingFiles, AreLittleLargerThanTheirLimit) {
+  RecordingOptions options;  // whose chunks are much larger
+  options.compression = Compression::none;
+  options.max_file_bytes = 20'000;
+  RecordingWriter writer = RecordingWriter::create(path("a.mcap"), options).value();
+  const auto stream = writer.add_stream(plain_stream("s", 24)).value();
+  for (int i = 0; i < 3000; ++i) write(writer, stream, sample_at(i, i));
+  ASSERT_TRUE(writer.finish());
+  EXPECT_GT(writer.progress().files, 3U);
+  for (const auto& file : std::filesystem::directory_iterator(folder_)) {
+    EXPECT_LT(file.file_size(), 30'000U) << file.path();
+  }
+}
+
 TEST_F(RecordingFiles, HaveADescriptionFromTheNextFileOn) {
   RecordingOptions options;
   options.chunk_bytes = 500;

@@ -156,6 +156,18 @@ TEST_F(SecureServer, SaysWhyACertificateIsNotAccepted) {
   expect_logged("'pc2' is not accepted: certificate has expired");
 }
 
+// As one that is years behind after its boot, until chronyd has set it: nobody restarts anything.
+TEST_F(SecureServer, TakesAHostAsSoonAsTheClockIsRight) {
+  Authority::Subject coming = Authority::host("pc2");
+  coming.valid_from = 2s;
+  Guest& guest = dial(with(issue(coming), "pc2"));
+  EXPECT_NE(wait_for_down(guest).find("compare the clocks"), std::string::npos)
+      << guest.downs.front();
+  expect_logged("'pc2' is not accepted: certificate is not yet valid");
+  run_until(loop, [&] { return guest.them.has_value(); });
+  EXPECT_TRUE(guest.them);
+}
+
 // A program of this PC that has no credentials.
 TEST_F(SecureServer, TakesPlainConnectionsFromItsOwnPc) {
   wait_until_up(dial(greeting_of("pc1", "viewer")));
