@@ -64,7 +64,8 @@ struct RecordedTrigger {
 struct RecordingOptions {
   Compression compression = Compression::lz4;
   // A chunk is closed, compressed and written at this size or age, whichever is first. A larger
-  // sample has a chunk of its own. 1 to kMaxPayloadBytes; at most an eighth of max_file_bytes counts.
+  // sample has a chunk of its own. 1 to kMaxPayloadBytes; with
+  // max_file_bytes, an eighth of that at most.
   std::uint64_t chunk_bytes = 1U << 20;
   Duration chunk_age = std::chrono::seconds(1);
   // Of chunks that wait for the disk. With more, write() waits.
