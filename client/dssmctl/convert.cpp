@@ -206,7 +206,8 @@ class Converter {
     Result<Converted> done = convert();
     const auto has_samples = [&](std::size_t stream) { return info(stream).samples > 0; };
     if (done && done->samples == 0 && std::ranges::any_of(wanted_, has_samples)) {
-      done = Error{Errc::protocol, "no sample of it can be read"};
+      done = Error{Errc::protocol,
+                   fmt::format("no sample of '{}' can be read", escaped(options_.file))};
     }
     std::error_code ignored;
     for (const fs::path& path : created_) {

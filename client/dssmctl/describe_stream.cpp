@@ -82,8 +82,8 @@ Result<void> check_replaceable(const StreamInfo& stream, const DescribeOptions& 
   return {};
 }
 
-// `found` for a stream whose own type has no fields: what that says is kept.
-void keep_own(TypeInfo& found, const TypeInfo& own) {
+// `found` for a stream whose own type has no fields, but may have a name, which is kept.
+void keep_declared_name(TypeInfo& found, const TypeInfo& own) {
   if (own.name.empty()) return;
   found.name = own.name;
   found.alignment_bytes = own.alignment_bytes;
@@ -106,7 +106,7 @@ Result<ProgramType> describe_stream(Session& session, const StreamInfo& stream,
         fmt::format("describe '{}': '{}' has no field that can be described: {}", stream.id.str(),
                     escaped(type.found.full_name), list_text(type.found.left_out))};
   }
-  if (!options.force) keep_own(described, stream.type);
+  if (!options.force) keep_declared_name(described, stream.type);
   DSSM_TRY(session.describe(stream.id, described, options.force));
   return type;
 }
@@ -183,10 +183,9 @@ std::optional<ProgramType> obvious_type_of_programs(Session& session, const Stre
   return *std::move(type);
 }
 
-std::map<std::string, TypeInfo> obvious_types_of_programs(Session& session,
-                                                          const std::vector<StreamInfo>& streams,
-                                                          Duration at_most) {
-  std::map<std::string, TypeInfo> types;
+std::map<std::pair<std::string, std::uint64_t>, TypeInfo> obvious_types_of_programs(
+    Session& session, const std::vector<StreamInfo>& streams, Duration at_most) {
+  std::map<std::pair<std::string, std::uint64_t>, TypeInfo> types;
   const MonoTime end = deadline_in(at_most);
   for (const StreamInfo& listed : streams) {
     if (MonoClock::now() >= end) break;
@@ -194,8 +193,8 @@ std::map<std::string, TypeInfo> obvious_types_of_programs(Session& session,
     const Result<StreamInfo> stream = session.stream_info(listed.id);
     if (!stream || !stream->type.fields.empty()) continue;
     if (std::optional<ProgramType> type = obvious_type_of_programs(session, listed.id)) {
-      keep_own(type->found.type, stream->type);
-      types.emplace(listed.id.str(), std::move(type->found.type));
+      keep_declared_name(type->found.type, stream->type);
+      types.emplace(std::pair(listed.id.str(), stream->incarnation), std::move(type->found.type));
     }
   }
   return types;

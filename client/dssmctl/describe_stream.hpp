@@ -9,6 +9,7 @@
 #include <map>
 #include <optional>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "client/dssmctl/debug_types.hpp"
@@ -32,11 +33,10 @@ Result<ProgramType> type_of_programs(Session& session, const StreamInfo& stream,
 // the user's own.
 std::optional<ProgramType> obvious_type_of_programs(Session& session, const StreamId& id);
 
-// The same for all `streams` that are not described, by StreamId::str(), for so long at most: large
-// programs take a second each.
-std::map<std::string, TypeInfo> obvious_types_of_programs(Session& session,
-                                                          const std::vector<StreamInfo>& streams,
-                                                          Duration at_most);
+// The same for all `streams` that are not described, by StreamId::str() and incarnation, for about
+// so long at most: large programs take a second each.
+std::map<std::pair<std::string, std::uint64_t>, TypeInfo> obvious_types_of_programs(
+    Session& session, const std::vector<StreamInfo>& streams, Duration at_most);
 
 // The same for a verb that shows samples of the reader's stream, if it is not described. A line on
 // standard error names the type and its program.

@@ -261,7 +261,7 @@ Result<void> run(const InfoOptions& options, Output& out) {
   const Result<Recording> recording = open_readable(options.stream);
   if (!recording) {
     return Error{shown.error().code,
-                 fmt::format("{}; and '{}' is no recording: {}", shown.error().message,
+                 fmt::format("{}; and '{}' is not a recording: {}", shown.error().message,
                              escaped(options.stream), recording.error().message)};
   }
   print_recording(*recording, options, out);

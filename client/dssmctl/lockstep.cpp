@@ -155,6 +155,7 @@ Result<void> Lockstep::start_program(const std::string& command, const std::stri
   ::posix_spawn_file_actions_destroy(&actions);
   if (failed) return os_error(fmt::format("start '{}'", escaped(command)), failed);
   program->runs = true;
+  program->processes.insert(program->process);
   programs_.push_back(std::move(program));
   return {};
 }
@@ -282,8 +283,10 @@ bool Lockstep::is_waiting(Program& program, bool with_all_threads, bool accept_e
       }
     }
   }
+  const auto is_asleep = [](pid_t process) { return are_all_asleep(process, {}); };
+  program.processes.insert(processes.begin(), processes.end());
   // It has closed its streams, and may be about to end, or to open others.
-  if (processes.empty()) return are_all_asleep(program.process, {});
+  if (processes.empty()) return std::ranges::all_of(program.processes, is_asleep);
   if (!with_all_threads) return true;
   const auto sleeps = [&](pid_t process) { return are_all_asleep(process, waiting); };
   if (!std::all_of(processes.begin(), processes.end(), sleeps)) return false;

@@ -138,6 +138,11 @@ class Player {
 
   // Creates the streams, once all of them have been checked.
   Result<void> prepare() {
+    if (!keyboard_.is_there() && options_.now && options_.start_paused) {
+      return Error{Errc::invalid_argument,
+                   "--start-paused --now: there is no terminal whose keys could let it run, and "
+                   "--now has no playback clock"};
+    }
     const DaemonInfo daemon = DSSM_TRY(session_.daemon_info());
     own_host_ = daemon.host;
     std::map<std::string, std::size_t> by_name;  // index in targets_
@@ -207,11 +212,6 @@ class Player {
 
   // As the timeline runs, until its end or Ctrl-C. Keys and other programs may change it.
   Result<void> play_by(Timeline& timeline) {
-    if (!keyboard_.is_there() && options_.now && options_.start_paused) {
-      return Error{Errc::invalid_argument,
-                   "--start-paused --now: there is no terminal whose keys could let it run, and "
-                   "--now has no playback clock"};
-    }
     if (keyboard_.is_there()) {
       out_.add(kKeys);
       shows_now_ = true;
@@ -222,7 +222,7 @@ class Player {
       const bool is_paused = timeline.is_paused(), backwards = timeline.speed() < 0;
       const Time paused_at = timeline.now();
       if (timeline.has_jumped()) {
-        tell_if_outside(timeline);
+        report_time_outside(timeline);
         DSSM_TRY(follow_jump(timeline.now(), timeline));
       } else if (is_paused) {
         DSSM_TRY(play_due(paused_at, backwards, timeline));
@@ -264,6 +264,7 @@ class Player {
     clock.set_paused(true);
     set_clock(range_.from);
     course_.seek(range_.from);
+    rest_ = range_.to - range_.from;
     bool goes_on = DSSM_TRY(lockstep.await_start());
     while (const RecordedSample* const next = goes_on ? course_.peek(false) : nullptr) {
       const Time time = next->info.time;
@@ -276,6 +277,7 @@ class Player {
       goes_on = DSSM_TRY(lockstep.settle());
     }
     if (!goes_on) return {};
+    rest_ = {};
     DSSM_TRY(set_last_properties());
     return lockstep.finish();
   }
@@ -283,8 +285,10 @@ class Player {
   void print_summary() {
     out_.clear_line();
     if (options_.json) {
-      out_.add(json_document(
-          {{"file", options_.file}, {"streams", targets_.size()}, {"samples", played_}}));
+      out_.add(json_document({{"file", options_.file},
+                              {"streams", targets_.size()},
+                              {"samples", played_},
+                              {"rest_ns", to_ns(rest_)}}));
     } else {
       out_.add(fmt::format(
           "{}: {} of {} played{}\n", escaped(options_.file), counted(played_, "sample", "samples"),
@@ -562,10 +566,12 @@ class Player {
     return set_properties(start);
   }
 
-  // As a player of SSM does when it begins: what follows is the end, which looks like success.
-  void tell_if_outside(const Timeline& timeline) const {
+  // As a player of SSM does when it begins. After the end nothing is left to play, which looks like
+  // success.
+  void report_time_outside(const Timeline& timeline) const {
     const Time now = timeline.now();
-    if (is_in_range(now)) return;
+    constexpr Duration kTolerance = std::chrono::milliseconds(1);  // it has run on since
+    if (now >= range_.from - kTolerance && now <= range_.to + kTolerance) return;
     out_.clear_line();
     print_notice(
         fmt::format("another program has set the playback clock to {}, where the recording "
@@ -751,9 +757,7 @@ Result<void> run(const PlayOptions& options, Output& out) {
   const auto play = [&]() -> Result<void> {
     std::unique_ptr<SharedPlayback> shared;
     if (clock) {
-      using With = SharedPlayback::With;
-      auto taken = SharedPlayback::take(
-          sharing, *clock, options.this_host ? With::this_host : With::all_hosts, print_notice);
+      auto taken = SharedPlayback::take(sharing, *clock, print_notice);
       if (!taken && taken.error().code == Errc::conflict) {
         return Error{Errc::conflict, taken.error().message +
                                          ". To play beside it: several files with one `dssmctl "
@@ -762,6 +766,7 @@ Result<void> run(const PlayOptions& options, Output& out) {
       shared = DSSM_TRY(std::move(taken));
     }
     DSSM_TRY(player.prepare());
+    if (shared && !options.this_host) shared->share_with_all_hosts();
     catch_stop_signals();
     Result<void> played;
     if (options.lockstep.empty()) {

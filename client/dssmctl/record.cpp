@@ -65,18 +65,17 @@ std::filesystem::path file_of(const RecordOptions& options) {
                                  : std::filesystem::path(options.file);
 }
 
-// What `echo` shows of streams that are not described, so that a recording has it, too.
-std::map<std::string, TypeInfo> types_of_programs(Session& session, const StreamFilter& filter) {
+// Has a recording of this PC's streams what `echo` shows of those that are not described.
+void add_types_of_programs(RecorderPlan& plan, Session& session) {
   constexpr Duration kMaxTime = std::chrono::seconds(1);
-  std::vector<StreamInfo> streams = session.list_streams().value_or(std::vector<StreamInfo>{});
-  std::erase_if(streams, [&](const StreamInfo& stream) { return !filter.takes(stream.id); });
-  auto types = obvious_types_of_programs(session, streams, kMaxTime);
-  if (types.empty()) return types;
+  std::vector<StreamInfo> streams = session.list_own_streams().value_or(std::vector<StreamInfo>{});
+  std::erase_if(streams, [&](const StreamInfo& stream) { return !plan.filter.takes(stream.id); });
+  plan.types_of_programs = obvious_types_of_programs(session, streams, kMaxTime);
+  if (plan.types_of_programs.empty()) return;
   std::vector<std::string> names;
-  for (const auto& [name, type] : types) names.push_back(escaped(name));
+  for (const auto& [stream, type] : plan.types_of_programs) names.push_back(escaped(stream.first));
   print_notice(fmt::format("with fields from the debug information of their programs: {}",
                            list_text(names, kMaxNamed)));
-  return types;
 }
 
 // Records until it is to end, and says how it goes: on a terminal in a line that is redrawn.
@@ -184,7 +183,7 @@ class RecordingRun {
   bool has_named_unused_ = false;
 };
 
-// What a disk has damaged stays lost: it is found by reading all, and said.
+// What a disk has damaged stays lost; it is found by reading all, and reported.
 Result<void> repair(const RecordOptions& options, Output& out) {
   const RecordingRepair repaired = DSSM_TRY(repair_recording(options.repair));
   const Recording recording = DSSM_TRY(open_recording(options.repair, {}));
@@ -208,12 +207,19 @@ Result<void> repair(const RecordOptions& options, Output& out) {
                                          bytes_text(repaired.removed_bytes))));
   }
   if (damages.empty()) return {};
+  const std::string file = escaped(options.repair);
+  if (readable >= repaired.samples) {
+    return Error{Errc::protocol,
+                 fmt::format("'{}' has damaged parts (above); all its samples can be read", file)};
+  }
   return Error{Errc::protocol,
-               fmt::format("'{}' is damaged: {} of its samples cannot be read, and nothing brings "
-                           "them back; `dssmctl convert {} OTHER.mcap` makes a recording of the "
-                           "others",
-                           escaped(options.repair), std::max(repaired.samples, readable) - readable,
-                           escaped(options.repair))};
+               fmt::format("{} of the samples of '{}' cannot be read, and nothing brings them "
+                           "back{}",
+                           repaired.samples - readable, file,
+                           readable == 0 ? ""
+                                         : fmt::format("; `dssmctl convert {} OTHER.mcap` makes a "
+                                                       "recording of the others",
+                                                       file))};
 }
 
 }  // namespace
@@ -252,7 +258,7 @@ Result<void> run(const RecordOptions& options, Output& out) {
                     options.black_box};
   plan.keep_removed = std::max(plan.keep_removed, options.before);
   // The past is overwritten meanwhile.
-  if (!options.past) plan.types_of_programs = types_of_programs(session, plan.filter);
+  if (!options.past) add_types_of_programs(plan, session);
   if (options.black_box) return run_black_box(options, std::move(session), plan, how, out);
 
   const std::filesystem::path file = file_of(options);

@@ -597,10 +597,9 @@ Result<void> Recorder::add_to_file(Source& source) {
   const RawReader& reader = source.reader;
   // It may have been described since it was opened.
   TypeInfo type = opener_.described(reader.id(), reader.incarnation()).value_or(reader.type());
-  if (const auto found = types_of_programs_.find(reader.id().str());
-      found != types_of_programs_.end() && type.payload_bytes == found->second.payload_bytes &&
-      type.is_less_described_than(found->second)) {
-    type = found->second;
+  if (type.fields.empty()) {
+    const auto found = types_of_programs_.find({reader.id().str(), reader.incarnation()});
+    if (found != types_of_programs_.end()) type = found->second;
   }
   source.number = DSSM_TRY(file_->add_stream(
       {reader.id(), type, reader.depth(), reader.cycle(), reader.incarnation(), source.property}));

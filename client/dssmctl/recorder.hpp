@@ -46,8 +46,9 @@ struct RecorderPlan {
   // their host, and it is not less than what begin() is to have of the past. Otherwise these stay
   // open, and their readers continue when the host is there again.
   Duration keep_removed = std::chrono::seconds(3);
-  // Of streams that are not described, by StreamId::str(): what their programs say of them.
-  std::map<std::string, TypeInfo> types_of_programs = {};
+  // Of streams that are not described: their types in the programs' debug information, by name and
+  // incarnation.
+  std::map<std::pair<std::string, std::uint64_t>, TypeInfo> types_of_programs = {};
 };
 
 class Recorder {
@@ -318,7 +319,7 @@ class Recorder {
 
   const bool is_on_demand_;
   bool is_recording_;  // in file_, which is not finished
-  const std::map<std::string, TypeInfo> types_of_programs_;
+  const std::map<std::pair<std::string, std::uint64_t>, TypeInfo> types_of_programs_;
   std::optional<RecordingWriter> file_;
   // What file_ has of a ring.
   struct Kept {

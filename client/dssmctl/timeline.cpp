@@ -31,20 +31,17 @@ Time time_from_seconds(double seconds) {
 }  // namespace
 
 Result<std::unique_ptr<SharedPlayback>> SharedPlayback::take(
-    Session session, PlaybackClock clock, With with,
-    std::function<void(const std::string&)> on_failure) {
+    Session session, PlaybackClock clock, std::function<void(const std::string&)> on_failure) {
   const std::uint64_t driver = std::random_device()() | 1U;
   DSSM_TRY(session.hold_playback_clock(driver));
-  return std::unique_ptr<SharedPlayback>(new SharedPlayback(std::move(session), std::move(clock),
-                                                            with, driver, std::move(on_failure)));
+  return std::unique_ptr<SharedPlayback>(
+      new SharedPlayback(std::move(session), std::move(clock), driver, std::move(on_failure)));
 }
 
-SharedPlayback::SharedPlayback(Session session, PlaybackClock clock, With with,
-                               std::uint64_t driver,
+SharedPlayback::SharedPlayback(Session session, PlaybackClock clock, std::uint64_t driver,
                                std::function<void(const std::string&)> on_failure)
     : session_(std::move(session)),
       clock_(std::move(clock)),
-      with_(with),
       on_failure_(std::move(on_failure)),
       driver_(driver),
       thread_([this] { run(); }) {}
@@ -69,13 +66,13 @@ void SharedPlayback::run() {
 
 void SharedPlayback::share(bool ends) {
   const auto report = [&](const std::string& host, const Error& error) {
-    if (ends || !reported_.insert(host).second) return;
+    if (ends || !reported_.emplace(host, error.code).second) return;
     const std::string reason = escaped_message(error.message);
     on_failure_(host.empty() ? reason
                              : fmt::format("the playback clock of '{}' does not follow: {}",
                                            escaped(host), reason));
   };
-  if (with_ == With::this_host) {
+  if (!has_all_hosts_) {
     if (Result<void> held = session_.hold_playback_clock(driver_, ends); !held) {
       report({}, held.error());
     }

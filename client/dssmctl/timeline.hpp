@@ -15,6 +15,7 @@
 #include <set>
 #include <string>
 #include <thread>
+#include <utility>
 
 namespace dssm::ctl {
 
@@ -25,15 +26,15 @@ inline double seconds_of(Time time) { return static_cast<double>(to_ns(time)) / 
 // it if asked, in a thread of its own: a host that does not answer delays nothing.
 class SharedPlayback {
  public:
-  enum class With { this_host, all_hosts };
   // A change that shall come at the same moment on all hosts is made so long before.
   static constexpr Duration kLead = std::chrono::milliseconds(50);
 
   // on_failure: gets a sentence for each host that does not follow, once, from the thread
   //   fails  conflict (another player has it), no_permission, unavailable
   static Result<std::unique_ptr<SharedPlayback>> take(
-      Session session, PlaybackClock clock, With with,
-      std::function<void(const std::string&)> on_failure);
+      Session session, PlaybackClock clock, std::function<void(const std::string&)> on_failure);
+  // From now on, those of all other hosts follow.
+  void share_with_all_hosts() { has_all_hosts_ = true; }
   SharedPlayback(const SharedPlayback&) = delete;
   SharedPlayback& operator=(const SharedPlayback&) = delete;
   ~SharedPlayback();  // the clocks of the other hosts show the real time again
@@ -42,17 +43,17 @@ class SharedPlayback {
   // A change that another program makes is found within this time.
   static constexpr Duration kCheckPeriod = std::chrono::milliseconds(5);
   static constexpr Duration kRenewPeriod = std::chrono::seconds(1);
-  SharedPlayback(Session session, PlaybackClock clock, With with, std::uint64_t driver,
+  SharedPlayback(Session session, PlaybackClock clock, std::uint64_t driver,
                  std::function<void(const std::string&)> on_failure);
   void run();
   void share(bool ends);
 
   Session session_;
   PlaybackClock clock_;
-  const With with_;
   const std::function<void(const std::string&)> on_failure_;
   const std::uint64_t driver_;
-  std::set<std::string> reported_;  // hosts
+  std::set<std::pair<std::string, Errc>> reported_;  // hosts, and why
+  std::atomic<bool> has_all_hosts_ = false;
   std::atomic<bool> ends_ = false;
   std::thread thread_;
 };

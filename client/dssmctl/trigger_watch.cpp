@@ -144,10 +144,11 @@ std::vector<std::string> TriggerEvaluator::rules_without(const StreamId& stream,
   for (std::size_t i = 0; i < rules_.size(); ++i) {
     const TriggerRule& rule = rules_[i];
     if (rule.kind != Kind::field || std::ranges::count(checks, i, &Check::rule) > 0) continue;
-    if (!checks.empty() && rule.target.find_first_of("*?[") != rule.target.npos) continue;
-    const auto parts = splits_at_dots(rule.target);
-    if (std::ranges::any_of(parts,
-                            [&](const auto& part) { return is_about(part.first, stream); })) {
+    const auto is_for_it = [&](const auto& part) {
+      const bool is_for_any = part.first.find_first_of("*?[") != part.first.npos;
+      return is_about(part.first, stream) && (checks.empty() || !is_for_any);
+    };
+    if (std::ranges::any_of(splits_at_dots(rule.target), is_for_it)) {
       names.push_back(rule.name);
     }
   }
@@ -397,8 +398,9 @@ void TriggerWatch::check_lists() {
   }
 }
 
-void TriggerWatch::tell_unfit_rules(const StreamId& stream, const std::vector<Field>& fields,
-                                    const std::vector<TriggerEvaluator::Check>& checks) {
+void TriggerWatch::report_rules_without_field(const StreamId& stream,
+                                              const std::vector<Field>& fields,
+                                              const std::vector<TriggerEvaluator::Check>& checks) {
   const std::vector<std::string> rules = evaluator_.rules_without(stream, checks);
   if (rules.empty()) return;
   constexpr std::size_t kMaxNamed = 20;
@@ -431,7 +433,7 @@ void TriggerWatch::subscribe_fields(const std::vector<StreamInfo>& streams) {
     watch.retry_at = deadline_in(kRetryPeriod);
     const std::vector<Field> fields = readable_fields_untrusted(type);
     std::vector<TriggerEvaluator::Check> checks = evaluator_.checks_of(stream.id, fields);
-    tell_unfit_rules(stream.id, fields, checks);
+    report_rules_without_field(stream.id, fields, checks);
     if (checks.empty()) continue;
     SubscribeOptions options;
     options.on_error = [this, name = stream.id.str()](const Error& error) {

@@ -137,8 +137,8 @@ class TriggerWatch {
   void run();
   void subscribe_requests();
   void check_lists();
-  void tell_unfit_rules(const StreamId& stream, const std::vector<Field>& fields,
-                        const std::vector<TriggerEvaluator::Check>& checks);
+  void report_rules_without_field(const StreamId& stream, const std::vector<Field>& fields,
+                                  const std::vector<TriggerEvaluator::Check>& checks);
   void subscribe_fields(const std::vector<StreamInfo>& streams);
   void notice(const std::string& text);
 

@@ -387,8 +387,9 @@ void LocalRequests::list_clock_pairs(Answer answer) {
 
 void LocalRequests::follow_playback(const Client& client, const proto::FollowPlayback& request,
                                     Answer answer) {
-  Result<proto::FollowPlayback> lead = clock_.lead(
-      request, fmt::format("{}@{}", client->program, registry_.host()), MonoClock::now());
+  Result<proto::FollowPlayback> lead =
+      clock_.lead(request, fmt::format("{}@{}", client->program, registry_.host()), client->number,
+                  MonoClock::now());
   if (!lead) return answer(std::move(lead).error());
   if (request.this_host()) {
     Reply reply;

@@ -100,6 +100,7 @@ ClientNumber LocalService::connect(const Identity& identity, ClientOutput& outpu
 }
 
 bool LocalService::disconnect(ClientNumber number, bool by_client) {
+  clock_.on_client_gone(number);
   if (const auto client = clients_.extract(number)) {
     end_watch(number, client.mapped());
     if (client.mapped().greeted) {

@@ -83,22 +83,25 @@ Result<void> PlaybackClockOwner::renew(const proto::FollowPlayback& request,
   if (request.driver() == 0) {
     return Error{Errc::invalid_argument, "a playback clock is to follow a driver without a number"};
   }
-  if (driver_ != 0 && driver_ != request.driver() && now < lease_end_) {
+  if (driver_ != 0 && driver_ != request.driver() && now < lease_end_ && !is_driver_gone_) {
     return Error{Errc::conflict,
                  "its playback clock follows " + in_quotes(driver_name_) + "; end that first"};
   }
   driver_ = request.ends() ? 0 : request.driver();
   driver_name_ = name.substr(0, kMaxDriverNameBytes);
   lease_end_ = now + kLease;
+  is_driver_gone_ = false;
   if (on_lease_) on_lease_();
   return {};
 }
 
 Result<proto::FollowPlayback> PlaybackClockOwner::lead(const proto::FollowPlayback& request,
-                                                       std::string driver_name, MonoTime now) {
+                                                       std::string driver_name, ClientNumber client,
+                                                       MonoTime now) {
   clock::PlaybackRecord* const own = DSSM_TRY(record());
   DSSM_TRY(renew(request, driver_name, now));
   follows_ = false;
+  client_ = client;
   proto::FollowPlayback out;
   out.set_driver(request.driver());
   out.set_driver_name(std::move(driver_name));
@@ -108,6 +111,10 @@ Result<proto::FollowPlayback> PlaybackClockOwner::lead(const proto::FollowPlayba
   out.mutable_playback()->set_change_s(setting.change_s);
   to_message(setting.before, *out.mutable_playback()->mutable_before());
   return out;
+}
+
+void PlaybackClockOwner::on_client_gone(ClientNumber client) noexcept {
+  if (driver_ != 0 && !follows_ && client_ == client) is_driver_gone_ = true;
 }
 
 Result<void> PlaybackClockOwner::follow_untrusted(const proto::FollowPlayback& request,

@@ -17,6 +17,7 @@
 #include "catalog.pb.h"
 #include "core/base/unique_fd.hpp"
 #include "core/clock/playback_record.hpp"
+#include "daemon/streams/stream.hpp"
 
 namespace dssm::daemon {
 
@@ -37,11 +38,14 @@ class PlaybackClockOwner {
   // Called with each new clock from now on; {}: no call.
   void on_new_clock(std::function<void(int fd)> then) { on_new_clock_ = std::move(then); }
 
-  // For a program of this PC that drives the clocks of other hosts: what they shall follow, as a
-  // request to them.
+  // For a program of this PC that drives this clock, and perhaps those of other hosts: what they
+  // shall follow, as a request to them.
   //   fails  as follow_untrusted(), and no_memory
   Result<proto::FollowPlayback> lead(const proto::FollowPlayback& request, std::string driver_name,
-                                     MonoTime now);
+                                     ClientNumber client, MonoTime now);
+  // That program has ended, or lost its connection: others may drive the clock from now on. If none
+  // does, it shows the real time again when the lease ends.
+  void on_client_gone(ClientNumber client) noexcept;
 
   // The clock is what `request` of another host says.
   //   fails  invalid_argument; conflict (another driver's lease has not ended); unavailable (a
@@ -69,7 +73,9 @@ class PlaybackClockOwner {
   std::function<void()> on_lease_;
   std::uint64_t driver_ = 0;  // 0: none
   std::string driver_name_;
-  bool follows_ = false;  // the driver runs on another host
+  ClientNumber client_ = 0;      // the driver, while it runs on this PC
+  bool is_driver_gone_ = false;  // others need not wait for the end of its lease
+  bool follows_ = false;         // the driver runs on another host
   MonoTime lease_end_{};
 };
 

@@ -106,7 +106,13 @@ TEST_F(Lockstep, EndsWithItsProgramsAndSaysHowMuchIsLeft) {
       output({"play", file_, "--lockstep", program("next-100") + " > /dev/null"});
   EXPECT_TRUE(contains(text, ": 111 samples of 2 streams played; ended 899 ms before its end"))
       << text;
+  // Also where a shell waits for the program.
+  const std::string piped = program("next-100").substr(5) + " | cat > /dev/null";
+  EXPECT_TRUE(contains(output({"play", file_, "--lockstep", piped}), ": 111 samples of 2 streams"));
   EXPECT_FALSE(contains(output({"play", file_, "--lockstep", program("wait")}), "before its end"));
+  EXPECT_FALSE(
+      contains(ctl({"play", file_, "slow", "--lockstep", program("wait")}).out, "before its end"));
+  EXPECT_TRUE(contains(output({"play", file_, "--lockstep", "true"}), "; ended 999 ms before"));
 }
 
 TEST_F(Lockstep, SaysWhichProgramFailed) {

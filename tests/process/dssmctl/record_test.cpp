@@ -583,9 +583,9 @@ TEST_F(Record, EndsInTimeAndShowsNumbersForPrograms) {
 
 TEST_F(Record, EndsAtATime) {
   auto pose = session_.create<RecordedPose>("pose", depth_of(64)).value();
-  const Time until = WallClock::now() + 200ms;
-  const std::string text =
-      output({"record", "--until", std::to_string(to_ns(until) / 1e9), "-o", file_});
+  const Time until = WallClock::now() + 2s;
+  const std::string text = output(
+      {"record", "--until", std::to_string(static_cast<double>(to_ns(until)) / 1e9), "-o", file_});
   EXPECT_GE(WallClock::now(), until);
   EXPECT_TRUE(contains(text, ": 0 samples of 1 stream")) << text;
 }
@@ -714,11 +714,11 @@ TEST_F(Play, SaysThatAPartIsDamaged) {
   EXPECT_EQ(repaired.exit_status, 1) << repaired.out;
   EXPECT_TRUE(contains(repaired.out, ": 0 samples, the file has its end, but parts are damaged"))
       << repaired.out;
-  EXPECT_TRUE(contains(repaired.err, "100 of its samples cannot be read")) << repaired.err;
+  EXPECT_TRUE(contains(repaired.err, "100 of the samples of")) << repaired.err;
   const std::string other = folder_.file("other.mcap");
   const Finished converted = ctl({"convert", file_, other});
   EXPECT_EQ(converted.exit_status, 1) << converted.out;
-  EXPECT_TRUE(contains(converted.err, "no sample of it can be read")) << converted.err;
+  EXPECT_TRUE(contains(converted.err, "no sample of '" + file_ + "' can be read")) << converted.err;
   EXPECT_FALSE(std::filesystem::exists(other));
 }
 
@@ -759,9 +759,9 @@ TEST_F(Play, SaysThatTheClockWasSetToAnotherTime) {
   auto clock = session_.open_playback_clock().value();
   await([&] { return clock.setting().speed == 0.001; });
   clock.set_time(5000);
-  while (!contains(running.line(), "another program has set the playback clock to 5000.")) {
-  }
   EXPECT_EQ(running.status(), 0);
+  const std::string text = running.rest();
+  EXPECT_TRUE(contains(text, "another program has set the playback clock to 5000.")) << text;
 }
 
 // A key would let it run, and there is no terminal.

@@ -156,7 +156,7 @@ TEST_F(SecureServer, SaysWhyACertificateIsNotAccepted) {
   expect_logged("'pc2' is not accepted: certificate has expired");
 }
 
-// As one that is years behind after its boot, until chronyd has set it: nobody restarts anything.
+// As one that is years behind after its boot, until chronyd has set it.
 TEST_F(SecureServer, TakesAHostAsSoonAsTheClockIsRight) {
   Authority::Subject coming = Authority::host("pc2");
   coming.valid_from = 2s;

@@ -52,7 +52,7 @@ TEST_F(PlaybackLease, BelongsToOneDriver) {
   ASSERT_FALSE(other);
   EXPECT_EQ(other.error().code, Errc::conflict);
   EXPECT_EQ(other.error().message, "its playback clock follows 'play@pc1'; end that first");
-  EXPECT_EQ(owner_.lead(request(2, 0), "play@pc3", start_).error().code, Errc::conflict);
+  EXPECT_EQ(owner_.lead(request(2, 0), "play@pc3", 3, start_).error().code, Errc::conflict);
   EXPECT_EQ(speed(), 3);
   // Late, but before check_lease().
   ASSERT_TRUE(owner_.follow_untrusted(request(2, 5), start_ + PlaybackClockOwner::kLease));
@@ -64,9 +64,18 @@ TEST_F(PlaybackLease, BelongsToOneDriver) {
   ASSERT_TRUE(owner_.follow_untrusted(request(3, 6), start_ + PlaybackClockOwner::kLease));
 }
 
+TEST_F(PlaybackLease, OfAProgramThatWasKilledGoesToTheNextOneAtOnce) {
+  ASSERT_TRUE(owner_.lead(request(1, 0), "play@pc1", 7, start_));
+  owner_.on_client_gone(8);
+  EXPECT_EQ(owner_.lead(request(2, 0), "play@pc1", 8, start_).error().code, Errc::conflict);
+  owner_.on_client_gone(7);
+  ASSERT_TRUE(owner_.lead(request(2, 0), "play@pc1", 9, start_));
+  EXPECT_EQ(owner_.lead(request(1, 0), "play@pc1", 7, start_).error().code, Errc::conflict);
+}
+
 TEST_F(PlaybackLease, NamesTheDriverOfAnotherHostUntilItEnds) {
   EXPECT_EQ(owner_.followed_driver(start_), "");
-  ASSERT_TRUE(owner_.lead(request(1, 0), "play@pc1", start_));
+  ASSERT_TRUE(owner_.lead(request(1, 0), "play@pc1", 1, start_));
   EXPECT_EQ(owner_.followed_driver(start_), "") << "a program of this PC";
   const MonoTime end = start_ + PlaybackClockOwner::kLease;
   proto::FollowPlayback follow = request(2, 3);
@@ -97,7 +106,7 @@ TEST_F(PlaybackLease, LeadsWithWhatThisClockIs) {
   record->update([](const auto&) { return clock::PlaybackSetting{{1, 2, 1, 4}, 5, {6, 7, 0, 9}}; });
   proto::FollowPlayback message;
   message.set_driver(8);
-  const proto::FollowPlayback lead = owner_.lead(message, "play@pc1", start_).value();
+  const proto::FollowPlayback lead = owner_.lead(message, "play@pc1", 1, start_).value();
   EXPECT_EQ(lead.driver(), 8U);
   EXPECT_EQ(lead.driver_name(), "play@pc1");
   const proto::Playback& playback = lead.playback();
