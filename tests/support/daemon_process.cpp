@@ -235,6 +235,8 @@ std::string credentials_for(const std::string& name) {
 std::string credentials_for_program(const std::string& name) {
   return vehicle().credentials_for("--program", name);
 }
+// NOLINTNEXTLINE(concurrency-mt-unsafe): nothing sets it
+bool tests_tls() { return std::getenv("DSSM_TEST_TLS") != nullptr; }
 std::string authority_folder() { return vehicle().dir + "/ca"; }
 
 DaemonProcess::DaemonProcess(std::vector<std::string> extra, const std::string& host)
@@ -251,8 +253,7 @@ DaemonProcess::DaemonProcess(std::vector<std::string> extra, const std::string& 
   const bool has_own_credentials = std::any_of(extra.begin(), extra.end(), [](const auto& word) {
     return word == "--credentials" || word == "--config";
   });
-  // NOLINTNEXTLINE(concurrency-mt-unsafe): nothing sets it
-  if (std::getenv("DSSM_TEST_TLS") && !has_own_credentials) {
+  if (tests_tls() && !has_own_credentials) {
     argv_.insert(argv_.end(), {"--credentials", credentials_for(host)});
   }
   argv_.insert(argv_.end(), extra.begin(), extra.end());
@@ -266,6 +267,8 @@ DaemonProcess::DaemonProcess(std::vector<std::string> extra, const std::string& 
 
 void DaemonProcess::call(const std::string& host) {
   *(std::find(argv_.begin(), argv_.end(), "--name") + 1) = host;
+  const auto credentials = std::find(argv_.begin(), argv_.end(), "--credentials");
+  if (credentials != argv_.end()) *(credentials + 1) = credentials_for(host);
 }
 
 void DaemonProcess::start() {

@@ -73,6 +73,8 @@ inline const std::vector<std::string> kPatientRecovery = {"--recovery-grace", "3
 // A folder with credentials for the host `name` of one vehicle, which is that of the whole test
 // program; made by dssmctl, removed when the program ends.
 std::string credentials_for(const std::string& name);
+// Whether connections between hosts are encrypted in this run: $DSSM_TEST_TLS is set.
+bool tests_tls();
 // The same for a program.
 std::string credentials_for_program(const std::string& name);
 // The folder of that vehicle's authority.

@@ -98,6 +98,9 @@ ServiceManager::~ServiceManager() {
 void ServiceManager::start() {
   std::vector<std::string> arguments = {built("daemon/dssmd"), "--runtime-dir", dir_, "--name",
                                         options_.host,         "--mdns=false"};
+  if (tests_tls()) {
+    arguments.insert(arguments.end(), {"--credentials", credentials_for(options_.host)});
+  }
   arguments.insert(arguments.end(), options_.arguments.begin(), options_.arguments.end());
   std::vector<int> fds;
   std::string names;
