@@ -74,8 +74,9 @@ void add_types_of_programs(RecorderPlan& plan, Session& session) {
   if (plan.types_of_programs.empty()) return;
   std::vector<std::string> names;
   for (const auto& [stream, type] : plan.types_of_programs) names.push_back(escaped(stream.first));
-  print_notice(fmt::format("with fields from the debug information of their programs: {}",
-                           list_text(names, kMaxNamed)));
+  print_error(
+      fmt::format("dssmctl: record: with fields from the debug information of their programs: {}\n",
+                  list_text(names, kMaxNamed)));
 }
 
 // Records until it is to end, and says how it goes: on a terminal in a line that is redrawn.
@@ -191,7 +192,9 @@ Result<void> repair(const RecordOptions& options, Output& out) {
   RecordingCursor cursor = recording.cursor();
   for (RecordedSample sample; cursor.next(sample);) ++readable;
   const std::vector<std::string> damages = recording.warnings();
-  for (const std::string& damage : damages) print_notice(escaped_message(damage));
+  for (const std::string& damage : damages) {
+    print_error(fmt::format("dssmctl: record: {}\n", escaped_message(damage)));
+  }
   if (options.json) {
     out.add(json_document({{"file", options.repair},
                            {"was_whole", repaired.was_whole && damages.empty()},

@@ -111,8 +111,10 @@ TEST_F(Describe, EchoAndRecordTakeTheFieldsOfAProgramThatRuns) {
   const std::string file = folder + "/odometry.mcap";
   const Finished record = ctl({"record", "--for", "10ms", "-o", file});
   EXPECT_EQ(record.exit_status, 0) << record.err;
-  EXPECT_THAT(record.err, HasSubstr("from the debug information of their programs: "
-                                    "spur_odometry:3@pc1\n"));
+  EXPECT_THAT(
+      record.err,
+      HasSubstr("dssmctl: record: with fields from the debug information of their programs: "
+                "spur_odometry:3@pc1\n"));
   EXPECT_THAT(ctl({"info", "--json", file}).out, HasSubstr("theta"));
   EXPECT_TRUE(session.stream_info(kStream)->type.fields.empty()) << "they change nothing";
 }
