@@ -24,7 +24,7 @@ namespace {
 
 // By then the streams that there are could have been opened.
 constexpr Duration kFirstNoticeTime = std::chrono::seconds(1);
-constexpr std::size_t kMaxNamed = 20;  // streams in one notice
+constexpr std::size_t kMaxNamedStreams = 20;  // streams in one notice
 
 // A folder is not created: it may be a disk that is not mounted, or a wrong name.
 Result<void> check_folder(const std::filesystem::path& folder) {
@@ -76,7 +76,7 @@ void add_types_of_programs(RecorderPlan& plan, Session& session) {
   for (const auto& [stream, type] : plan.types_of_programs) names.push_back(escaped(stream.first));
   print_error(
       fmt::format("dssmctl: record: with fields from the debug information of their programs: {}\n",
-                  list_text(names, kMaxNamed)));
+                  list_text(names, kMaxNamedStreams)));
 }
 
 // Records until it is to end, and says how it goes: on a terminal in a line that is redrawn.
@@ -156,7 +156,7 @@ class RecordingRun {
     notice(
         fmt::format("without descriptions, so only with their bytes: {}; `dssmctl describe "
                     "STREAM` before a recording gives a stream fields",
-                    list_text(names, kMaxNamed)));
+                    list_text(names, kMaxNamedStreams)));
   }
 
   void notice(const std::string& text) {
