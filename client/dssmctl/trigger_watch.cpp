@@ -404,9 +404,10 @@ void TriggerWatch::report_rules_without_field(const StreamId& stream,
   const std::vector<std::string> rules = evaluator_.rules_without(stream, checks);
   if (rules.empty()) return;
   constexpr std::size_t kMaxNamed = 20;
-  std::vector<std::string> names;
+  std::vector<std::string> names, quoted;
+  names.reserve(fields.size());
+  quoted.reserve(rules.size());
   for (const Field& field : fields) names.push_back(escaped(field.name));
-  std::vector<std::string> quoted;
   for (const std::string& rule : rules) quoted.push_back(fmt::format("'{}'", escaped(rule)));
   const std::string name = escaped(stream.str());
   notice(fmt::format(
