@@ -43,7 +43,7 @@ constexpr std::uint64_t kMaxEntries = 1U << 26;  // of a file; some seconds
 constexpr std::uint64_t kMaxSteps = 1U << 20;    // to list the fields of a type
 constexpr int kMaxTypeNesting = 32;
 constexpr int kMaxQualifiers = 64;            // typedefs of typedefs
-constexpr std::size_t kMaxCandidates = 4096;  // as many again that a program makes streams of
+constexpr std::size_t kMaxCandidates = 4096;  // and as many types of streams
 constexpr std::size_t kMaxLeftOut = 100;
 constexpr std::size_t kMaxShownTypes = 20;
 

@@ -165,10 +165,10 @@ Result<ProgramType> type_of_programs(Session& session, const StreamInfo& stream,
   return first_type(DSSM_TRY(programs_here(session, stream)), stream, type_name);
 }
 
-std::optional<ProgramType> obvious_type_of_programs(Session& session, const StreamId& id) {
-  const Result<StreamInfo> stream = session.stream_info(id);
-  if (!stream) return std::nullopt;
-  Result<std::vector<StreamUser>> programs = programs_here(session, *stream);
+namespace {
+
+std::optional<ProgramType> obvious_type_of(Session& session, const StreamInfo& stream) {
+  Result<std::vector<StreamUser>> programs = programs_here(session, stream);
   if (!programs) return std::nullopt;
   // A file may be made to harm who parses it.
   std::erase_if(*programs, [](const StreamUser& program) {
@@ -176,11 +176,18 @@ std::optional<ProgramType> obvious_type_of_programs(Session& session, const Stre
     return ::stat(file_of(program).c_str(), &file) != 0 ||
            (file.st_uid != 0 && file.st_uid != ::geteuid());
   });
-  Result<ProgramType> type = first_type(*programs, *stream, "");
-  const bool is_obvious = type && (type->found.is_stream_type || !stream->type.name.empty() ||
-                                   is_named_alike(type->found.type.name, stream->id.name));
+  Result<ProgramType> type = first_type(*programs, stream, "");
+  const bool is_obvious = type && (type->found.is_stream_type || !stream.type.name.empty() ||
+                                   is_named_alike(type->found.type.name, stream.id.name));
   if (!is_obvious || type->found.type.fields.empty()) return std::nullopt;
   return *std::move(type);
+}
+
+}  // namespace
+
+std::optional<ProgramType> obvious_type_of_programs(Session& session, const StreamId& id) {
+  const Result<StreamInfo> stream = session.stream_info(id);
+  return stream ? obvious_type_of(session, *stream) : std::nullopt;
 }
 
 std::map<std::pair<std::string, std::uint64_t>, TypeInfo> obvious_types_of_programs(
@@ -192,7 +199,7 @@ std::map<std::pair<std::string, std::uint64_t>, TypeInfo> obvious_types_of_progr
     // Lists leave out the fields of many types; the stream may be gone by now.
     const Result<StreamInfo> stream = session.stream_info(listed.id);
     if (!stream || !stream->type.fields.empty()) continue;
-    if (std::optional<ProgramType> type = obvious_type_of_programs(session, listed.id)) {
+    if (std::optional<ProgramType> type = obvious_type_of(session, *stream)) {
       keep_declared_name(type->found.type, stream->type);
       types.emplace(std::pair(listed.id.str(), stream->incarnation), std::move(type->found.type));
     }

@@ -64,8 +64,8 @@ struct RecordedTrigger {
 struct RecordingOptions {
   Compression compression = Compression::lz4;
   // A chunk is closed, compressed and written at this size or age, whichever is first. A larger
-  // sample has a chunk of its own. 1 to kMaxPayloadBytes; with
-  // max_file_bytes, an eighth of that at most.
+  // sample has a chunk of its own. 1 to kMaxPayloadBytes. With max_file_bytes, chunks have at most
+  // an eighth of that.
   std::uint64_t chunk_bytes = 1U << 20;
   Duration chunk_age = std::chrono::seconds(1);
   // Of chunks that wait for the disk. With more, write() waits.
