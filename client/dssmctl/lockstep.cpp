@@ -55,26 +55,40 @@ std::optional<std::uint64_t> sleep_count(pid_t process, const std::string& threa
   return 0;
 }
 
-// The sum for all threads of the process but `except`; empty: one of them does not sleep.
-std::optional<std::uint64_t> sleep_count_of_all(pid_t process, const std::set<pid_t>& except) {
+// The sum for all threads of `processes` but `except`; empty: one of them does not sleep.
+std::optional<std::uint64_t> sleep_count_of_all(const std::set<pid_t>& processes,
+                                                const std::set<pid_t>& except) {
   std::uint64_t sum = 0;
-  std::error_code error;
-  for (const auto& entry :
-       std::filesystem::directory_iterator(fmt::format("/proc/{}/task", process), error)) {
-    const std::string thread = entry.path().filename();
-    if (except.contains(std::atoi(thread.c_str()))) continue;
-    const auto count = sleep_count(process, thread);
-    if (!count) return std::nullopt;
-    sum += *count;
+  for (const pid_t process : processes) {
+    std::error_code error;
+    for (const auto& entry :
+         std::filesystem::directory_iterator(fmt::format("/proc/{}/task", process), error)) {
+      const std::string thread = entry.path().filename();
+      if (except.contains(std::atoi(thread.c_str()))) continue;
+      const auto count = sleep_count(process, thread);
+      if (!count) return std::nullopt;
+      sum += *count;
+    }
   }
   return sum;
 }
 
 // Whether there is a moment at which all these threads sleep. One that is asked early may be woken
-// by one that is asked late: none may have slept again until it is asked again.
-bool are_all_asleep(pid_t process, const std::set<pid_t>& except) {
-  const auto count = sleep_count_of_all(process, except);
-  return count && sleep_count_of_all(process, except) == count;
+// by one that is asked late: none may have slept again, or ended, until it is asked again.
+bool are_all_asleep(const std::set<pid_t>& processes, const std::set<pid_t>& except) {
+  const auto count = sleep_count_of_all(processes, except);
+  return count && sleep_count_of_all(processes, except) == count;
+}
+
+// What a shell started, without an interactive one's jobs.
+std::set<pid_t> processes_of_group(pid_t group) {
+  std::set<pid_t> processes;
+  std::error_code error;
+  for (const auto& entry : std::filesystem::directory_iterator("/proc", error)) {
+    const pid_t process = std::atoi(entry.path().filename().c_str());
+    if (process > 0 && ::getpgid(process) == group) processes.insert(process);
+  }
+  return processes;
 }
 
 std::string end_text(int status) {
@@ -155,7 +169,6 @@ Result<void> Lockstep::start_program(const std::string& command, const std::stri
   ::posix_spawn_file_actions_destroy(&actions);
   if (failed) return os_error(fmt::format("start '{}'", escaped(command)), failed);
   program->runs = true;
-  program->processes.insert(program->process);
   programs_.push_back(std::move(program));
   return {};
 }
@@ -283,13 +296,16 @@ bool Lockstep::is_waiting(Program& program, bool with_all_threads, bool accept_e
       }
     }
   }
-  const auto is_asleep = [](pid_t process) { return are_all_asleep(process, {}); };
   program.processes.insert(processes.begin(), processes.end());
-  // It has closed its streams, and may be about to end, or to open others.
-  if (processes.empty()) return std::ranges::all_of(program.processes, is_asleep);
+  if (processes.empty()) {
+    // It has closed its streams, and may be about to end, or to open others. A shell ends after
+    // all that it started.
+    std::set<pid_t> all = processes_of_group(program.process);
+    all.insert(program.processes.begin(), program.processes.end());
+    return are_all_asleep(all, {});
+  }
   if (!with_all_threads) return true;
-  const auto sleeps = [&](pid_t process) { return are_all_asleep(process, waiting); };
-  if (!std::all_of(processes.begin(), processes.end(), sleeps)) return false;
+  if (!are_all_asleep(processes, waiting)) return false;
   // None of them did anything while the others were asked.
   const auto is_there = [&](const LockstepPlace& place) {
     return place.state.load() == LockstepPlace::waiting || !waiting.contains(place.thread.load());

@@ -71,7 +71,7 @@ class Lockstep {
     pid_t process = -1;
     bool runs = false;
     int status = 0;
-    std::set<pid_t> processes;        // that have had a place, and the shell
+    std::set<pid_t> processes;        // that have had a place
     std::set<pid_t> elsewhere;        // threads with a place that sleep in another way
     std::uint32_t lost_requests = 0;  // that will not end
     clock::LockstepPage& page() const noexcept { return mapping.as<clock::LockstepPage>(); }

@@ -106,9 +106,12 @@ TEST_F(Lockstep, EndsWithItsProgramsAndSaysHowMuchIsLeft) {
       output({"play", file_, "--lockstep", program("next-100") + " > /dev/null"});
   EXPECT_TRUE(contains(text, ": 111 samples of 2 streams played; ended 899 ms before its end"))
       << text;
-  // Also where a shell waits for the program.
-  const std::string piped = program("next-100").substr(5) + " | cat > /dev/null";
-  EXPECT_TRUE(contains(output({"play", file_, "--lockstep", piped}), ": 111 samples of 2 streams"));
+  // Also where a shell waits for the program, and for what still works after it.
+  const std::string piped = program("next-100").substr(5) +
+                            " | { cat > /dev/null; i=0; while [ $i -lt 50000 ]; do "
+                            "i=$((i + 1)); done; }";
+  const std::string text_of_piped = output({"play", file_, "--lockstep", piped});
+  EXPECT_TRUE(contains(text_of_piped, ": 111 samples of 2 streams")) << text_of_piped;
   EXPECT_FALSE(contains(output({"play", file_, "--lockstep", program("wait")}), "before its end"));
   EXPECT_FALSE(
       contains(ctl({"play", file_, "slow", "--lockstep", program("wait")}).out, "before its end"));
