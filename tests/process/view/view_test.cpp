@@ -527,6 +527,7 @@ struct ViewOfASlowNetwork : WithStreamOwner, CtlTest {
 };
 
 TEST_F(ViewOfASlowNetwork, ShowsThePresentToFoxgloveThoughEarlierSamplesAreStillToCome) {
+  if (tests_tls()) GTEST_SKIP() << "the peer is this test, which does not speak TLS";
   Running view(view_argv({"--listen", "127.0.0.1:0"}), environment());
   const std::string line = view.line();
   const std::size_t at = line.find("http://");
