@@ -210,8 +210,8 @@ class Converter {
                    fmt::format("no sample of '{}' can be read", escaped(options_.file))};
     }
     std::error_code ignored;
-    for (const fs::path& path : created_) {
-      if (!done) fs::remove(path, ignored);
+    for (auto path = created_.rbegin(); !done && path != created_.rend(); ++path) {
+      fs::remove(*path, ignored);
     }
     return done;
   }
@@ -233,7 +233,7 @@ class Converter {
       return Error{Errc::invalid_argument, too_many_for_a_log()};
     }
     std::error_code error;
-    fs::create_directories(out, error);
+    if (fs::create_directories(out, error)) created_.push_back(out);
     if (error) return os_error(fmt::format("create folder '{}'", out.string()), error.value());
     return to_logs(log_paths(out));
   }

@@ -69,7 +69,7 @@ std::filesystem::path file_of(const RecordOptions& options) {
 void add_types_of_programs(RecorderPlan& plan, Session& session) {
   constexpr Duration kMaxTime = std::chrono::seconds(1);
   std::vector<StreamInfo> streams = session.list_own_streams().value_or(std::vector<StreamInfo>{});
-  std::erase_if(streams, [&](const StreamInfo& stream) { return !plan.filter.takes(stream.id); });
+  std::erase_if(streams, [&](const StreamInfo& stream) { return !plan.takes(stream); });
   plan.types_of_programs = obvious_types_of_programs(session, streams, kMaxTime);
   if (plan.types_of_programs.empty()) return;
   std::vector<std::string> names;

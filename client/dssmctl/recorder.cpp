@@ -48,6 +48,13 @@ Time after(Time time) { return saturating_add(time, Duration(1)); }
 
 }  // namespace
 
+bool RecorderPlan::takes(const StreamInfo& stream) const {
+  const auto fits = [&](const std::string& type) {
+    return ::fnmatch(type.c_str(), stream.type.name.c_str(), 0) == 0;
+  };
+  return filter.takes(stream.id) && (types.empty() || std::ranges::any_of(types, fits));
+}
+
 // --- opening
 
 // The time `past` before `now`, by the stamps of the stream.
@@ -83,14 +90,6 @@ Result<void> Recorder::Opener::begin() {
   return {};
 }
 
-bool Recorder::Opener::wants(const StreamInfo& stream) const {
-  return plan_.filter.takes(stream.id) &&
-         (plan_.types.empty() ||
-          std::any_of(plan_.types.begin(), plan_.types.end(), [&](const std::string& type) {
-            return ::fnmatch(type.c_str(), stream.type.name.c_str(), 0) == 0;
-          }));
-}
-
 void Recorder::Opener::on_event(const StreamEvent& event) {
   const std::string name = event.stream.id.str();
   const std::lock_guard lock(mutex_);
@@ -99,7 +98,7 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
   std::optional<std::uint64_t> replaced_incarnation;
   bool is_open = false;
   bool is_other_type = false;  // than its reader can continue with
-  if (event.kind == StreamEvent::Kind::added && wants(event.stream)) {
+  if (event.kind == StreamEvent::Kind::added && plan_.takes(event.stream)) {
     std::erase_if(unused_patterns_, [&](const std::string& pattern) {
       return fits_pattern(event.stream.id, pattern);
     });
@@ -153,7 +152,7 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
     });
     return;
   }
-  if (!wants(event.stream) || (is_open && !replaced_incarnation) ||
+  if (!plan_.takes(event.stream) || (is_open && !replaced_incarnation) ||
       std::any_of(wanted_.begin(), wanted_.end(), is_same_stream)) {
     return;
   }

@@ -32,6 +32,7 @@ namespace dssm::ctl {
 struct RecorderPlan {
   StreamFilter filter;
   std::vector<std::string> types;  // shell patterns, one of which its type's name fits; empty: all
+  bool takes(const StreamInfo& stream) const;  // by filter and types
   // From so long before now: what the rings hold still. Empty: from now on.
   std::optional<Duration> past;
   // Instead of `past`: samples of these times only, first and last included, by their stamps.
@@ -228,7 +229,6 @@ class Recorder {
     void check_removed(std::unique_lock<std::mutex>& lock, const Removed& removed);
     // The one to try next; the end: none.
     std::vector<Wanted>::iterator next_wanted();
-    bool wants(const StreamInfo& stream) const;
     void notice_reopening(const StreamId& id, const std::string& reason);
     void notice_missed(const StreamId& id);
     void on_event(const StreamEvent& event);

@@ -116,6 +116,10 @@ TEST_F(Describe, EchoAndRecordTakeTheFieldsOfAProgramThatRuns) {
       HasSubstr("dssmctl: record: with fields from the debug information of their programs: "
                 "spur_odometry:3@pc1\n"));
   EXPECT_THAT(ctl({"info", "--json", file}).out, HasSubstr("theta"));
+  const Finished others =
+      ctl({"record", "--for", "10ms", "--type", "Other", "-o", folder + "/other.mcap"});
+  EXPECT_EQ(others.exit_status, 0) << others.err;
+  EXPECT_THAT(others.err, Not(HasSubstr("debug information"))) << "the stream is not recorded";
   EXPECT_TRUE(session.stream_info(kStream)->type.fields.empty()) << "they change nothing";
 }
 
