@@ -108,7 +108,10 @@ class ProgramRun:
 
     def ahead(self) -> tuple[float, float]:
         """This machine's monotonic clock minus the guest's raw one, and its width."""
-        assert self._ahead_min <= self._ahead_max, "the guest's raw clock and this machine's clock drift"
+        assert self._ahead_min <= self._ahead_max, (
+            "the guest's raw clock and this machine's clock drift: one is ahead by at least"
+            f" {self._ahead_min:.0f} ns and at most {self._ahead_max:.0f} ns, in"
+            f" {(self.observations[-1].came - self.observations[0].came) / SECOND_NS:.0f} s")
         return ((self._ahead_min + self._ahead_max) / 2, (self._ahead_max - self._ahead_min) / 2)
 
     def wall_at(self, raw: float, observation: Observation) -> tuple[float, float] | None:
