@@ -39,8 +39,6 @@ QUICK_NS = 150_000  # slower readings of a guest's clocks are not used as measur
 LIMIT_NS = 1_500_000  # dssmd's default clock_limit
 NEAR_NS = LIMIT_NS / 3
 NEAR_SECONDS = 5  # longer than a sample counts by what was measured before
-MAX_SLEW_RATE = 1 / 12  # chronyd's maxslewrate
-SLEWED_MUCH_NS = 20_000  # between two observations: chronyd corrects what it measured, not only its rate
 STEADY_SECONDS = 1.5  # recovered after this time with good statements only
 RECOVERY_SECONDS = 180
 SECOND_NS = 10**9
@@ -117,15 +115,13 @@ class ProgramRun:
         return ((self._ahead_min + self._ahead_max) / 2, (self._ahead_max - self._ahead_min) / 2)
 
     def wall_at(self, raw: float, observation: Observation) -> tuple[float, float] | None:
-        """The wall clock of `observation` at the raw time `raw`, and its width: by how much the PC may have
-        slewed in between."""
+        """The wall clock of `observation` at the raw time `raw`, and its width: by how much the PC slewed in
+        between."""
         index = bisect.bisect_right(self.observations, raw, key=lambda each: each.raw) - 1
         if index < 0:
             return None
         before = self.observations[index]
         slewed = abs((observation.mono - before.mono) - (observation.raw - before.raw))
-        if slewed > SLEWED_MUCH_NS:  # and perhaps to and fro
-            slewed = max(slewed, MAX_SLEW_RATE * (observation.raw - raw))
         return observation.wall - (observation.raw - raw), observation.within + slewed
 
 
@@ -371,7 +367,7 @@ KINDS = ("by_time", "newest", "joint")
 NOTICE_NS = 0.25 * SECOND_NS
 # And after its last answer, chronyd may have slewed a wrong clock for a second at its maxslewrate
 # (83,333 ppm); same section. The times of such a clock are never accepted.
-SLEWED_NS = SECOND_NS * MAX_SLEW_RATE
+SLEWED_NS = SECOND_NS / 12
 
 
 def expect_true(truth: Truth) -> None:
