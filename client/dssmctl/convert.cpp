@@ -210,6 +210,7 @@ class Converter {
                    fmt::format("no sample of '{}' can be read", escaped(options_.file))};
     }
     std::error_code ignored;
+    // From the end: a folder, which was created before its files, has to be empty.
     for (auto path = created_.rbegin(); !done && path != created_.rend(); ++path) {
       fs::remove(*path, ignored);
     }

@@ -109,8 +109,8 @@ class ProgramRun:
     def ahead(self) -> tuple[float, float]:
         """This machine's monotonic clock minus the guest's raw one, and its width."""
         assert self._ahead_min <= self._ahead_max, (
-            "the guest's raw clock and this machine's clock drift: one is ahead by at least"
-            f" {self._ahead_min:.0f} ns and at most {self._ahead_max:.0f} ns, in"
+            "the guest's raw clock and this machine's clock drift: their difference is at least"
+            f" {self._ahead_min:.0f} ns by one answer and at most {self._ahead_max:.0f} ns by another, within"
             f" {(self.observations[-1].came - self.observations[0].came) / SECOND_NS:.0f} s")
         return ((self._ahead_min + self._ahead_max) / 2, (self._ahead_max - self._ahead_min) / 2)
 
