@@ -335,8 +335,8 @@ class RecordingSoak : public NetworkTest {
       SCOPED_TRACE(recorded.stream + " of life " + std::to_string(recorded.life));
       EXPECT_LE(recorded.missing, recorded.lost);
       const KnownStream& known = known_.at(recorded.stream);
-      // A ring of another host may be full when its stream comes: its oldest samples are overwritten
-      // while it is opened, and count as lost, too.
+      // Another host's ring may be full when its stream comes: its oldest samples are
+      // overwritten while it is opened, and count as lost, too.
       const bool is_own = recorded.stream.ends_with("@" + Network::name(kRecorder));
       if (static_cast<std::int64_t>(known.depth) * known.cycle >= kLongHistory) {
         EXPECT_LE(is_own ? recorded.lost : recorded.missing, groups_[0].lost(recorded.stream))
